@@ -58,10 +58,23 @@ def test_a_report_against_another_label_or_none_there_is(
     code, out, err = run_command(*arguments, "--against", "consistency")
     assert code == 0, err
     assert "baseline against consistency" in out
-    assert "change from consistency, %" in out
     code, _, err = run_command(*arguments, "--against", "gone")
     assert code == 1
     assert "--against gone: the sweep has no such label; choose from: baseline, consistency" in err
+
+
+@pytest.mark.slow
+def test_a_report_tests_the_outcomes_that_are_named(run_command: RunCommand, store: Path) -> None:
+    arguments = ("report", store.parent, "--store", "s", "--pictures", "none")
+    named = ("--outcomes", "lpips", "ssim", "--headline", "consistency", "--margin-lpips", "7")
+    code, out, err = run_command(*arguments, *named)
+    assert code == 0, err
+    assert "the outcomes of this report are LPIPS, SSIM" in out
+    assert "0.2 dB of PSNR or 7 % of LPIPS" in out
+    assert "the p of consistency, corrected by Holm" in out
+    code, _, err = run_command(*arguments, "--outcomes", "nice")
+    assert code == 1
+    assert "--outcomes nice: there is no such metric; choose from: " in err
 
 
 def test_a_sweep_that_is_not_there_is_named(call_command: RunCommand, tmp_path: Path) -> None:

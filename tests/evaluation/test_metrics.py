@@ -29,6 +29,8 @@ MORE_IS_BETTER = {
     "lpips": False,
     "ssim": True,
     "psnr": True,
+    "psnr_pooled": True,
+    "psnr_worst": True,
     "psnr_plain": True,
     "psnr_fitted": True,
     "evaluations": False,
@@ -151,6 +153,8 @@ def test_the_rows_of_the_tables() -> None:
         "memory_bytes": "bytes",
         "peak_rss_bytes": "bytes",
         "psnr": "dB",
+        "psnr_pooled": "dB",
+        "psnr_worst": "dB",
         "psnr_plain": "dB",
         "psnr_fitted": "dB",
     }

@@ -1,4 +1,4 @@
-"""Scatter, agreement and tests of means over replicates and scenes, of made-up pairs."""
+"""Scatter, signs, intervals and tests of means over replicates and scenes, of made-up pairs."""
 
 import math
 from typing import Any
@@ -9,39 +9,52 @@ from scipy import stats
 
 from tests.report.test_compare import AMOUNTS, SCENES, compared, mean_of
 from xrgs.evaluation.metrics import METRICS
+from xrgs.report.compare import Comparison, Design, compare
 from xrgs.report.inference import NOT_MEASURED
 
 
-def test_pairs_that_agree_are_counted_by_the_sign_of_the_mean(made: Any) -> None:
-    """Scenes' means are +20 and -5, so the mean is up: 3 of 5 pairs are."""
-    for scene, changes in (("fern", (30.0, 10.0)), ("room", (-9.0, 3.0, -9.0))):
+def test_scenes_are_counted_by_the_sign_of_their_mean(made: Any) -> None:
+    """Scenes' means are up, down, up and level: the mean is up, as 2 of 4 scenes are."""
+    by_scene = {
+        "fern": (30.0, -10.0), "room": (-9.0, 3.0, -9.0), "trex": (10.0,), "horns": (0.0,)
+    }  # fmt: skip
+    for scene, changes in by_scene.items():
         for seed, change in enumerate(changes):
             made.add(scene=scene, seed=seed)
-            factors = {"gaussians": 1 + change / 100, "psnr": 1.0}
+            factors = {"gaussians": math.exp(change / 100), "psnr": 1.0}
             made.add("consistency", scene=scene, seed=seed, factors=factors)
     comparison = compared(made)
     row = mean_of(comparison, "gaussians")
-    of_fern, of_room = 1.3 * 1.1, 0.91 * 1.03 * 0.91
-    ratio = math.sqrt(of_fern ** (1 / 2) * of_room ** (1 / 3))
-    assert row["change"] == pytest.approx(100 * (ratio - 1))
-    assert (row["agree"], row["pairs"]) == (3, 5)
+    assert row["change"] == pytest.approx(100 * math.expm1(0.15 / 4), abs=0.05)  # whole Gaussians
+    assert tuple(row[["up", "down", "n", "pairs"]]) == (2, 1, 4, 7)
+    assert row["p_sign"] == pytest.approx(stats.binomtest(2, 3).pvalue)
     room = comparison.per_scene.xs(("consistency", "", "room", "gaussians"))
-    assert (room["agree"], room["pairs"]) == (2, 3)
-    assert tuple(mean_of(comparison, "psnr")[["agree", "pairs"]]) == (5, 5), "all are unchanged"
+    assert tuple(room[["up", "down", "n", "pairs"]]) == (1, 2, 3, 3)
+    same = mean_of(comparison, "psnr")
+    assert tuple(same[["up", "down", "n", "p_sign"]]) == (0, 0, 4, 1.0)
 
 
-def test_a_pair_without_a_change_neither_agrees_nor_counts(made: Any) -> None:
+def test_the_signs_of_a_single_scene_are_of_its_replicates(made: Any) -> None:
+    for seed, factor in enumerate((1.1, 1.2, 0.9)):
+        made.add(seed=seed)
+        made.add("consistency", seed=seed, factors={"psnr": factor})
+    row = mean_of(compared(made), "psnr")
+    assert tuple(row[["up", "down", "n", "unit"]]) == (2, 1, 3, "replicates")
+
+
+def test_a_pair_without_a_change_does_not_count(made: Any) -> None:
     for seed, lpips in enumerate((None, 0.25)):
         made.add(seed=seed, values={"lpips": lpips})
         made.add("consistency", seed=seed, factors={"psnr": 1.1})
-    assert tuple(mean_of(compared(made), "lpips")[["agree", "pairs"]]) == (1, 1)
+    row = mean_of(compared(made), "lpips")
+    assert tuple(row[["up", "down", "n", "pairs"]]) == (0, 0, 1, 1)
 
 
 def add_nested(made: Any, changes: dict[str, tuple[float, ...]], metric: str = "psnr") -> None:
-    """Pairs of each scene: percentages of a score, or logarithms times 100 of an amount."""
+    """Pairs of each scene: dB of PSNR, or logarithms times 100 of an amount."""
     for scene, of_scene in changes.items():
         for seed, change in enumerate(of_scene):
-            factor = math.exp(change / 100) if metric in AMOUNTS else 1 + change / 100
+            factor = math.exp(change / 100) if metric in AMOUNTS else 1 + change / 20
             made.add(scene=scene, seed=seed)
             made.add("consistency", scene=scene, seed=seed, factors={metric: factor})
 
@@ -72,28 +85,113 @@ def test_one_replicate_a_scene_has_no_scatter_of_replicates(made: Any) -> None:
     assert row["scatter_scenes"] == pytest.approx(math.sqrt(2))
 
 
-def test_q_is_over_all_ablations_and_metrics_of_a_condition(made: Any) -> None:
-    """Three scenes, of which scipy tests the means; a condition of two has no test."""
+@pytest.mark.parametrize("metric", ["psnr", "evaluations"])
+def test_the_interval_of_a_new_scene_is_scipys(made: Any, metric: str) -> None:
+    add_nested(made, NESTED, metric)
+    row = mean_of(compared(made), metric)
+    half = stats.t.ppf(0.975, 2) * 4.0 * math.sqrt(1 + 1 / 3)
+    wanted = [7 - half, 7 + half]
+    if metric in AMOUNTS:
+        wanted = [100 * math.expm1(end / 100) for end in wanted]
+    assert (row["new_low"], row["new_high"]) == pytest.approx(wanted)
+
+
+def test_one_scene_says_nothing_of_a_new_one(made: Any) -> None:
+    add_nested(made, {"fern": (1.0, 3.0, 5.0)})
+    row = mean_of(compared(made), "psnr")
+    assert not math.isnan(row["low"])
+    assert math.isnan(row["new_low"])
+
+
+SCORES, WORK = ("psnr", "psnr_pooled", "psnr_worst", "lpips"), ("evaluations", "gaussians")
+
+
+def add_random(made: Any, labels: tuple[str, ...], conditions: dict[str, int]) -> None:
+    """Conditions of so many scenes, in which every metric of every label differs by chance."""
     rng = np.random.default_rng(0)
-    always = [metric for metric in METRICS if not metric.optional]
-    for condition, scenes in (("", SCENES[:3]), ("train.steps=9", SCENES[:3]), ("two", SCENES[:2])):
-        for scene in scenes:
+    always = [m.name for m in METRICS if not m.optional and m.name not in SCORES[1:3]]
+    for condition, scenes in conditions.items():
+        for scene in SCENES[:scenes]:
             made.add(scene=scene, condition=condition)
-            for label in ("a", "b"):
-                of = {metric.name: rng.uniform(0.99, 1.02) for metric in always}
+            for label in labels:
+                of = {name: rng.uniform(0.99, 1.02) for name in always}
                 made.add(label, scene=scene, condition=condition, factors=of)
+
+
+def p_of(comparison: Comparison, condition: str) -> dict[Any, float]:
+    """The p of each label and metric of a condition, by scipy."""
+    pairs = comparison.pairs[comparison.pairs["condition"] == condition]
+    effects = pairs.groupby(["label", "metric"])["effect"]
+    return {key: stats.ttest_1samp(of, 0).pvalue for key, of in effects if of.notna().all()}
+
+
+def test_q_is_over_the_outcomes_of_a_condition_scores_and_amounts_apart(made: Any) -> None:
+    """Three scenes, of which scipy tests the means; a condition of two has no test."""
+    add_random(made, ("a", "b"), {"": 3, "train.steps=9": 3, "two": 2})
     comparison = compared(made)
-    effects = comparison.pairs.groupby(["label", "condition", "metric"])["effect"].agg(list)
     for condition in ("", "train.steps=9"):
-        means = comparison.means.xs(condition, level="condition")
-        tests = [stats.ttest_1samp(of, 0).pvalue for of in effects.xs(condition, level=1)]
-        wanted = dict(zip(effects.xs(condition, level=1).index, tests, strict=True))
-        p = [wanted[key] for key in means.index]
-        assert len(p) == 2 * len(always)
-        assert means["p"].to_numpy() == pytest.approx(p, rel=1e-7)
-        assert means["q"].to_numpy() == pytest.approx(stats.false_discovery_control(p), rel=1e-7)
+        p = p_of(comparison, condition)
+        q = comparison.means["q"].xs(condition, level="condition")
+        for family in (SCORES, WORK):
+            keys = [(label, metric) for label in ("a", "b") for metric in family]
+            wanted = stats.false_discovery_control([p[key] for key in keys])
+            assert q[keys].to_numpy() == pytest.approx(wanted, rel=1e-7)
+        assert q.notna().sum() == 2 * len(SCORES + WORK)
     assert comparison.means.xs("two", level="condition")[["p", "q"]].isna().to_numpy().all()
-    assert comparison.per_scene["q"].isna().all()
+
+
+def test_headline_labels_are_corrected_by_holm_among_themselves(made: Any) -> None:
+    """The corrected p of hand: p times the number of p that are not smaller, made monotone."""
+    add_random(made, ("a", "b", "c"), {"": 4})
+    design = Design(outcomes=("psnr", "lpips", "gaussians"), headline=("a", "c"))
+    means = compare(made.read().cells, METRICS, design=design).means.xs("", level="condition")
+    for family in (("psnr", "lpips"), ("gaussians",)):
+        keys = [(label, metric) for label in ("a", "c") for metric in family]
+        p = means["p"][keys].sort_values()
+        by_rank = p.to_numpy() * np.arange(len(p), 0, -1)
+        wanted = np.minimum(1, np.maximum.accumulate(by_rank))
+        assert means["holm"][p.index].to_numpy() == pytest.approx(wanted)
+    assert means["holm"].xs("b", level="label").isna().all()
+    assert means["holm"].notna().sum() == 6
+    assert means["q"].notna().sum() == 9
+
+
+def test_what_is_no_outcome_is_no_test(made: Any) -> None:
+    add_random(made, ("a",), {"": 3})
+    design = Design(outcomes=("ssim",))
+    means = compare(made.read().cells, METRICS, design=design).means.droplevel([0, 1])
+    assert means.index[means["outcome"]].tolist() == ["ssim"]
+    assert means["q"]["ssim"] == pytest.approx(means["p"]["ssim"])
+    assert means["q"].notna().sum() == means["p_equivalent"].notna().sum() == 1
+
+
+def test_equal_values_are_no_members_of_the_family(made: Any) -> None:
+    """An ablation that changes no score would halve q of the other one's, or double it."""
+    for number, scene in enumerate(SCENES[:3]):
+        made.add(scene=scene)
+        made.add("same", scene=scene)
+        made.add("other", scene=scene, factors={"lpips": 0.9 + number / 100})
+    means = compared(made).means.xs("", level="condition")
+    assert means["q"]["other", "lpips"] == pytest.approx(means["p"]["other", "lpips"])
+    assert means["q"].xs("same").isna().all()
+    assert (means["p_equivalent"].xs("same").dropna() == 0).all()
+
+
+def test_equivalence_is_within_the_margins_of_the_design(made: Any) -> None:
+    """In dB for PSNR, by log ratio for LPIPS; of other metrics without a margin."""
+    offs = (-0.02, 0.0, 0.02, 0.04)
+    for scene, off in zip(SCENES, offs, strict=False):
+        made.add(scene=scene)
+        factors = {"psnr": 1 + off / 20, "lpips": math.exp(off), "gaussians": 1 + off}
+        made.add("a", scene=scene, factors=factors)
+    for psnr, lpips in ((0.2, 5.0), (0.02, 2.0)):
+        design = Design(margin_psnr=psnr, margin_lpips=lpips)
+        means = compare(made.read().cells, METRICS, design=design).means.droplevel([0, 1])
+        for name, margin in (("psnr", psnr), ("lpips", math.log(1 + lpips / 100))):
+            tests = [stats.ttest_1samp(offs, -margin, alternative="greater").pvalue,
+                     stats.ttest_1samp(offs, margin, alternative="less").pvalue]  # fmt: skip
+            assert means["p_equivalent"][name] == pytest.approx(max(tests), rel=1e-6)
+        assert means["p_equivalent"]["gaussians"] >= 0.5
 
 
 def test_means_of_base_and_value_cover_the_pairs_that_have_a_change(made: Any) -> None:
@@ -110,5 +208,5 @@ def test_means_of_base_and_value_cover_the_pairs_that_have_a_change(made: Any) -
         comparison.per_scene.xs(("consistency", "", "fern", "lpips")),
     ):
         assert row["change"] == pytest.approx(100)
-        assert tuple(row[["base", "value", "difference"]]) == pytest.approx((0.1, 0.2, 0.1))
+        assert tuple(row[["base", "value"]]) == pytest.approx((0.1, 0.2))
         assert (row["scenes"], row["pairs"], row["why"]) == (1, 1, NOT_MEASURED)

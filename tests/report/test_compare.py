@@ -1,4 +1,4 @@
-"""The arithmetic of percentage changes, against numbers worked out elsewhere."""
+"""The arithmetic of changes, against numbers worked out elsewhere."""
 
 import math
 from typing import Any
@@ -8,9 +8,10 @@ import pandas as pd
 import pytest
 from scipy import stats
 
+from tests.report.conftest import finish_again
 from xrgs.evaluation.metrics import METRICS, VIEW_METRICS
 from xrgs.report.collect import ReportError
-from xrgs.report.compare import Comparison, compare, is_amount
+from xrgs.report.compare import Comparison, Design, compare, scored_by
 from xrgs.report.inference import (
     NO_ALL_HR,
     NO_GAP,
@@ -20,9 +21,8 @@ from xrgs.report.inference import (
     OTHER_CODE,
     OTHER_MACHINE,
     WRONG_GAP,
-    ZERO_BASE,
 )
-from xrgs.report.writing import percent
+from xrgs.report.paper import paper_tables
 
 #: Table 1 of the paper: mean change over seven scenes, and the arrow printed beside it.
 TABLE_1 = {
@@ -56,37 +56,90 @@ def mean_of(comparison: Comparison, metric: str, label: str = "consistency") -> 
 
 
 def test_the_papers_table_1(made: Any) -> None:
+    """Pairs that have the paper's percentages as their mean ratio give its table again."""
     for number, (scene, off) in enumerate(zip(SCENES, SCATTER, strict=True)):
         size = dict.fromkeys(TABLE_1, 1.0 + number)  # no ratio of means would give the answer
         change = dict(size)
         for name, (mean, _) in TABLE_1.items():
-            ratio, percent_off = 1 + mean / 100, off / 100
-            ratio = ratio * math.exp(percent_off) if name in AMOUNTS else ratio + percent_off
-            change[name] *= ratio
+            change[name] *= (1 + mean / 100) * math.exp(off / 100)
         many = {"gaussians": 5 * 10**12}  # whole numbers, whose ratios are rounded little
         made.add(scene=scene, factors=size, values=many)
         made.add("xrgs", scene=scene, factors=change, values=many)
-    comparison = compared(made)
+    (table,) = paper_tables(compared(made), {})
+    rows = {row[1]: row[2:] for row in table.rows}
     for metric in METRICS:
         if metric.name not in TABLE_1:
             continue
         expected, arrow = TABLE_1[metric.name]
-        row = mean_of(comparison, metric.name, "xrgs")
-        assert row["change"] == pytest.approx(expected, abs=1e-9)
-        assert percent(row["change"], metric) == f"{expected:+.2f} {arrow}"
-        assert row["n"] == 7
-        offs = np.array(SCATTER) / 100
-        if metric.name in AMOUNTS:
-            offs += math.log(1 + expected / 100)
-            wanted = [100 * (math.exp(end) - 1) for end in interval_of(offs)]
-        else:
-            wanted = [100 * end for end in interval_of(offs + expected / 100)]
-        assert (row["low"], row["high"]) == pytest.approx(wanted, rel=1e-9)
+        paper, here, interval, ratio, *_ = rows[metric.label]
+        assert paper == here == f"{expected:+.2f} {arrow}"
+        assert ratio == ("" if metric.name == "memory_bytes" else "1.00")
+        offs = np.array(SCATTER) / 100 + math.log(1 + expected / 100)
+        low, high = (100 * math.expm1(end) for end in interval_of(offs))
+        assert interval == f"{low:+.2f} to {high:+.2f}"
 
 
-def test_times_counts_and_memory_are_compared_by_ratio_and_scores_are_not() -> None:
-    assert {metric.name for metric in METRICS if is_amount(metric)} >= AMOUNTS
-    assert not any(is_amount(metric) for metric in METRICS if metric.name in {*GAP})
+def test_psnr_is_compared_in_db_and_all_else_by_ratio(made: Any) -> None:
+    for scene, off in zip(SCENES, SCATTER, strict=True):
+        made.add(scene=scene)
+        factors = {"lpips": math.exp(off / 100), "ssim": math.exp(off / 100)}
+        values = {"psnr": 21 + off / 10}
+        made.add("consistency", scene=scene, factors=factors, values=values)
+    comparison = compared(made)
+    offs = np.array(SCATTER)
+    for name in ("lpips", "ssim"):
+        row = mean_of(comparison, name)
+        wanted = [100 * math.expm1(end) for end in interval_of(offs / 100)]
+        assert (row["low"], row["high"]) == pytest.approx(wanted)
+    row = mean_of(comparison, "psnr")
+    assert row["change"] == pytest.approx(1.0)
+    assert (row["low"], row["high"]) == pytest.approx(tuple(interval_of(1 + offs / 10)))
+
+
+def test_what_follows_from_psnr_is_scored_by_its_code() -> None:
+    found = {metric.name: scored_by(metric) for metric in METRICS}
+    assert {name for name, score in found.items() if not score} >= AMOUNTS
+    assert found["psnr_pooled"] == found["psnr_worst"] == "psnr"
+    assert {found[name] for name in GAP} == {*GAP}
+
+
+def test_the_worst_view_and_the_pooled_error_are_of_each_cells_views(made: Any) -> None:
+    made.add()  # of 20.05 and 19.95 dB
+    cell = made.add("consistency")
+    (cell.path / "scores.csv").write_text("view,psnr,ssim,lpips\nIMG_001,30,1,0\nIMG_009,10,1,0\n")
+    finish_again(cell)
+    comparison = compared(made)
+    worst, pooled = (mean_of(comparison, f"psnr_{name}") for name in ("worst", "pooled"))
+    assert worst["change"] == pytest.approx(10 - 19.95)
+    assert pooled["value"] == pytest.approx(-10 * math.log10((1e-3 + 1e-1) / 2))
+
+
+def test_outcomes_come_first_in_their_own_order(made: Any) -> None:
+    made.add()
+    made.add("consistency")
+    design = Design(outcomes=("ssim", "gaussians"))
+    comparison = compare(made.read().cells, METRICS, design=design)
+    names = [metric.name for metric in comparison.metrics]
+    always = [metric.name for metric in METRICS if not metric.optional]
+    assert names[:2] == ["ssim", "gaussians"]
+    assert names[2:] == [name for name in always if name not in names[:2]]
+
+
+@pytest.mark.parametrize(
+    ("design", "message"),
+    [
+        (Design(outcomes=("psnr", "nice")), r"outcomes=nice: .* metric; choose from: .*psnr"),
+        (
+            Design(headline=("plus",)),
+            r"headline=plus: .* label; choose from: baseline, c",
+        ),
+    ],
+)
+def test_an_unknown_outcome_or_headline_is_refused(made: Any, design: Design, message: str) -> None:
+    made.add()
+    made.add("consistency")
+    with pytest.raises(ReportError, match=message):
+        compare(made.read().cells, METRICS, design=design)
 
 
 def test_an_optional_score_is_compared_where_a_cell_has_it(made: Any) -> None:
@@ -95,7 +148,7 @@ def test_an_optional_score_is_compared_where_a_cell_has_it(made: Any) -> None:
     assert "psnr_plain" not in [metric.name for metric in compared(made).metrics]
     made.add(seed=1, values={"psnr_plain": 20.0})
     made.add("consistency", seed=1, values={"psnr_plain": 22.0})
-    assert mean_of(compared(made), "psnr_plain")["change"] == pytest.approx(10)
+    assert mean_of(compared(made), "psnr_plain")["change"] == pytest.approx(2.0)
 
 
 def test_scenes_count_once_however_many_seeds_they_have(made: Any) -> None:
@@ -105,18 +158,17 @@ def test_scenes_count_once_however_many_seeds_they_have(made: Any) -> None:
     made.add(scene="room")
     made.add("consistency", scene="room", factors={"gaussians": 2.0, "ssim": 2.0})
     comparison = compared(made)
-    row = mean_of(comparison, "ssim")
-    assert row["change"] == pytest.approx((20 + 100) / 2)
+    row = mean_of(comparison, "gaussians")
     assert (row["n"], row["unit"], row["scenes"]) == (2, "scenes", 2)
     geometric = math.sqrt((1.1 * 1.2 * 1.3) ** (1 / 3) * 2.0)
-    assert mean_of(comparison, "gaussians")["change"] == pytest.approx(100 * (geometric - 1))
+    assert row["change"] == pytest.approx(100 * (geometric - 1))
 
 
 def test_one_scene_has_its_interval_over_seeds(made: Any) -> None:
     changes = (-3.0, -1.0, 5.0)
     for seed, change in enumerate(changes):
         made.add(seed=seed)
-        made.add("consistency", seed=seed, factors={"psnr": 1 + change / 100})
+        made.add("consistency", seed=seed, values={"psnr": 20 + change})
     row = mean_of(compared(made), "psnr")
     wanted = stats.t.interval(0.95, 2, loc=np.mean(changes), scale=stats.sem(changes))
     assert (row["low"], row["high"]) == pytest.approx(wanted, rel=1e-9)
@@ -127,8 +179,7 @@ def test_one_seed_has_no_interval(made: Any) -> None:
     made.add()
     made.add("consistency", factors={"psnr": 1.1})
     row = mean_of(compared(made), "psnr")
-    assert row["change"] == pytest.approx(10)
-    assert row["difference"] == pytest.approx(2.0)  # dB
+    assert row["change"] == pytest.approx(2.0)  # dB
     assert math.isnan(row["low"])
     assert math.isnan(row["high"])
 
@@ -193,7 +244,7 @@ def test_a_pair_that_is_left_out_does_not_narrow_the_interval(made: Any) -> None
     assert row["change"] == pytest.approx(100 * (math.exp(np.mean(logs)) - 1))
     assert (row["low"], row["high"]) == pytest.approx(ends, rel=1e-9)
     assert (row["base"], row["value"]) == pytest.approx((150, 206)), "of the same two pairs"
-    assert row["why"] == ZERO_BASE
+    assert row["why"] == NOT_POSITIVE
 
 
 @pytest.mark.parametrize("against", ["baseline", "consistency"])
@@ -241,9 +292,10 @@ def test_a_draw_of_the_hr_views_is_a_replicate_with_a_variant_of_its_own(made: A
     """Three draws in a scene: paired within each, averaged over them, one interval of three."""
     changes = (10.0, 20.0, 60.0)
     for draw, change in enumerate(changes):
-        made.add(draw=draw, seed=draw, variant=f"v{draw}", factors={"psnr": 1.0 + draw})
-        factors = {"psnr": (1.0 + draw) * (1 + change / 100)}
-        made.add("consistency", draw=draw, seed=draw, variant=f"v{draw}", factors=factors)
+        own = 20.0 * (1 + draw)
+        made.add(draw=draw, seed=draw, variant=f"v{draw}", values={"psnr": own})
+        values = {"psnr": own + change}
+        made.add("consistency", draw=draw, seed=draw, variant=f"v{draw}", values=values)
     comparison = compared(made)
     pairs = comparison.pairs.query("metric == 'psnr'")
     assert list(zip(pairs["variant_seed"], pairs["seed"], strict=True)) == [(0, 0), (1, 1), (2, 2)]
@@ -313,7 +365,7 @@ def test_the_share_of_the_gap_is_averaged_by_scene_and_then_over_scenes(made: An
     assert row["change"] == pytest.approx(12.5)
     interval = stats.t.interval(0.95, 1, loc=12.5, scale=stats.sem([50.0, -25.0]))
     assert (row["low"], row["high"]) == pytest.approx(interval, rel=1e-9)
-    assert (row["agree"], row["pairs"]) == (2, 3)
+    assert (row["up"], row["down"], row["pairs"]) == (1, 1, 3)
 
 
 @pytest.mark.parametrize(
@@ -361,7 +413,7 @@ def test_a_score_is_compared_where_the_same_code_has_computed_it(made: Any) -> N
         made.add("consistency", scene=scene, factors={"psnr": 1.1, "ssim": 0.9})
     comparison = compared(made)
     psnr, ssim = (mean_of(comparison, name) for name in ("psnr", "ssim"))
-    assert (psnr["change"], psnr["scenes"], psnr["why"]) == (pytest.approx(10), 1, OTHER_CODE)
+    assert (psnr["change"], psnr["scenes"], psnr["why"]) == (pytest.approx(2), 1, OTHER_CODE)
     assert (ssim["scenes"], ssim["why"]) == (2, "")
 
 
@@ -412,7 +464,7 @@ def test_the_arithmetic_does_not_grow_faster_than_the_cells(made: Any) -> None:
     ablation = base.assign(label="a", cell_id=[f"a{number}" for number in range(n)])
     ablation[names] = rng.uniform(1, 2, (n, len(names)))
     comparison = compare(pd.concat([base, ablation], ignore_index=True), METRICS)
-    change = 100 * (ablation["psnr"] / base["psnr"] - 1)
+    change = ablation["psnr"] - base["psnr"]
     by_scene = [np.mean(change[np.array(scenes) == name]) for name in dict.fromkeys(scenes)]
     assert mean_of(comparison, "psnr", "a")["change"] == pytest.approx(np.mean(by_scene))
 
@@ -438,9 +490,7 @@ def test_another_label_is_the_base_of_its_own_scene_condition_and_replicate(made
         "xrgs": None,
     }
     assert list(xrgs["base"]) == pytest.approx([20, 21, 22, 23])
-    assert list(baseline["effect"]) == pytest.approx(
-        [100 * (10 / base - 1) for base in (20, 21, 22, 23)]
-    )
+    assert list(baseline["effect"]) == pytest.approx([10 - base for base in (20, 21, 22, 23)])
     assert comparison.means.loc[("xrgs", "train.steps=9", "psnr"), "base"] == pytest.approx(23)
     assert comparison.missing().empty
 

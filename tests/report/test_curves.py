@@ -106,6 +106,7 @@ def test_times_are_shares_of_the_paired_baseline(made: Any) -> None:
     assert found.loc[("fern", "fast", 1), "seconds"] == pytest.approx(30.0)
     assert found.loc[("fern", "fast", 1), "seconds_share"] == pytest.approx(0.3)
     assert found.loc[("fern", "fast", 1), "evaluations_share"] == pytest.approx(0.3)
+    assert found.loc[("fern", "fast", 1), "evaluations_own_share"] == pytest.approx(0.3)
     # From 66 s at 19 dB to 84 s at 21 dB.
     assert found.loc[("horns", "fast", 0), "seconds"] == pytest.approx(75.0)
     # From 20 s at 19 dB to the end at 100 s with 20.5 dB.
@@ -122,12 +123,30 @@ def test_the_table_says_what_was_not_reached(made: Any) -> None:
     rows = {row[:2]: row[2:] for row in made_of.rows}
     not_all = "not reached 1 of 2"
     assert rows["fern", "Time, s"] == ("100.0", "25.0", not_all, "")
-    assert rows["fern", "Time, % of baseline's"] == ("100", "25", not_all, "")
+    assert rows["fern", "time, % of baseline's whole training"] == ("100", "25", not_all, "")
     assert rows["fern", "Alpha evaluations, 10^9"] == ("1", "0.25", not_all, "")
     assert rows["horns", "Time, s"] == ("100.0", "75.0", "", "")
-    mean = rows["mean over scenes", "Time, % of baseline's"]
+    mean = rows["mean over scenes", "time, % of baseline's whole training"]
     assert mean == ("100", "50", "not reached", "")  # 25 and 75: each scene counts once
-    assert len(rows) == 4 + 4 + 2
+    assert len(rows) == 6 + 6 + 4
+    assert next(iter(rows))[1] == "Alpha evaluations, 10^9", "the measure of work"
+
+
+def test_a_base_that_falls_has_its_own_first_passage_beside_it(made: Any) -> None:
+    """The base has its final 20 dB after 30 of 100 s and 3 of 10 evaluations, and falls again."""
+    made.add(quality=quality([15.0, 19.0, 20.0, 22.0, 18.0], seconds=10, evaluations=1e8))
+    made.add("fast", quality=quality([19.0, 21.0], seconds=10, evaluations=2e8))
+    sweep = read(made)
+    found = times(sweep.cells, sweep.done).set_index("label")
+    assert found.loc["baseline", "seconds_share"] == pytest.approx(0.3)
+    assert found.loc["baseline", "seconds_own_share"] == pytest.approx(1.0)
+    assert found.loc["fast", "seconds_share"] == pytest.approx(0.15)
+    assert found.loc["fast", "seconds_own_share"] == pytest.approx(0.5)
+    assert found.loc["fast", "evaluations_own_share"] == pytest.approx(1.0)
+    made_of = table(times(sweep.cells, sweep.done), ["baseline", "fast"], "", "baseline")
+    rows = {row[1]: row[2:] for row in made_of.rows}
+    assert rows["% of baseline's own first passage"] == ("100", "100")
+    assert rows["time, % of baseline's own first passage"] == ("100", "50")
 
 
 def test_a_time_of_another_machine_is_no_share_of_the_baselines(made: Any) -> None:
@@ -141,7 +160,8 @@ def test_a_time_of_another_machine_is_no_share_of_the_baselines(made: Any) -> No
     made_of = table(times(sweep.cells, sweep.done), ["fast"], "", "baseline")
     rows = {row[1]: row[2] for row in made_of.rows}
     assert rows["Time, s"] == "16.7"
-    assert rows["Time, % of baseline's"] == "n/a"
+    assert rows["time, % of baseline's whole training"] == "n/a"
+    assert rows["time, % of baseline's own first passage"] == "n/a"
 
 
 def test_an_ablation_whose_baseline_failed_has_no_time(made: Any) -> None:
@@ -189,7 +209,7 @@ def test_the_report_has_figure_tables_and_files(made: Any) -> None:
     made.write()
     report = build(made.store.path, pictures=["time-to-quality", "time-to-quality-2"])
     page = (report.folder / "table.md").read_text()
-    assert "Time and work to the PSNR at which baseline ends" in page
+    assert "Work and time to the PSNR at which baseline ends" in page
     assert "figures/time-to-quality-2.png" in page
     with (report.folder / "curves.csv").open(newline="") as stream:
         rows = list(csv.DictReader(stream))

@@ -19,11 +19,11 @@ from xrgs.safeio.records import read_table
 
 
 def table(folder: Path) -> dict[str, float]:
-    """Return the change of PSNR of each scene and of the mean, in percent."""
+    """Return the change of PSNR of each scene and of the mean, in dB."""
     header, rows = read_table(folder / "table.csv")
     found = [dict(zip(header, row, strict=True)) for row in rows]
     return {
-        f"{row['label']} {row['level']} {row['scene']}".rstrip(): float(row["change_percent"])
+        f"{row['label']} {row['level']} {row['scene']}".rstrip(): float(row["change"])
         for row in found
         if row["metric"] == "psnr"
     }
@@ -31,7 +31,7 @@ def table(folder: Path) -> dict[str, float]:
 
 @pytest.fixture
 def two(made: Any, tmp_path: Path) -> tuple[Path, Path, str, str]:
-    """Two stores, each with a sweep of one scene: PSNR changes by 10 % and by 20 %."""
+    """Two stores, each with a sweep of one scene: PSNR changes by 2 dB and by 4 dB."""
     ids = []
     for name, scene, factor in (("a", "fern", 1.1), ("b", "room", 1.2)):
         made.rows.clear()
@@ -54,9 +54,9 @@ def test_sweeps_of_two_stores_are_joined(two: tuple[Path, Path, str, str], tmp_p
     report = build([a, b], pictures=[])
     assert report.folder == a / "reports" / f"{first}+{second}"
     changes = table(report.folder)
-    assert changes["plus scene fern"] == pytest.approx(10)
-    assert changes["plus scene room"] == pytest.approx(20)
-    assert changes["plus mean"] == pytest.approx(15)
+    assert changes["plus scene fern"] == pytest.approx(2)
+    assert changes["plus scene room"] == pytest.approx(4)
+    assert changes["plus mean"] == pytest.approx(3)
     text = (report.folder / "table.md").read_text()
     assert f"Sweep {first}: " in text
     assert f"Sweep {second}: " in text
@@ -122,7 +122,7 @@ def test_a_sweep_that_runs_is_reported_with_what_is_done(made: Any) -> None:
     remove_cell(made.store.cell(made.rows[3]["cell_id"]))
     made.rows.append(made.rows[1] | {"cell_id": None, "label": "count_matched"})
     report = build(made.store.path, made.write(), pictures=[])
-    assert table(report.folder)["plus mean"] == pytest.approx(10)
+    assert table(report.folder)["plus mean"] == pytest.approx(2)
     assert "3 of 5 cells are not done yet" in report.text
     assert "3 of 5 cells gave no number" in report.text
     for reason in (

@@ -56,6 +56,19 @@ def test_a_sign_is_confirmed_refuted_or_open(made: Any) -> None:
     assert rows["LPIPS"][2] == "+23.15 ↓"
 
 
+def test_a_size_stands_beside_the_papers_where_the_quantity_is_the_same(made: Any) -> None:
+    for scene, off in zip(SCENES, (0.99, 1.0, 1.01), strict=True):
+        add(made, scene, lpips=1.463 * off, memory_bytes=0.535 * off, psnr=1.008 * off)
+    (table,) = tables(made)
+    column = table.columns.index("here / paper")
+    rows = {row[1]: row for row in table.rows}
+    assert rows["LPIPS"][column] == "2.00"  # +46.3 % beside +23.15 %
+    assert rows["PSNR"][column] == "-1.00"  # +0.80 % beside -0.80 %
+    assert rows["Memory"][column] == ""
+    assert rows["Memory"][-1] == "not comparable"
+    assert any(note.startswith("Memory is not comparable: ") for note in table.notes)
+
+
 def test_two_values_leave_a_sign_open(made: Any) -> None:
     for scene in SCENES[:2]:
         add(made, scene, gaussians=0.3)
@@ -155,9 +168,9 @@ def test_scenes_are_in_the_order_of_their_texture(made: Any) -> None:
     expected = [f"{scene} ({10 * place / 255:.4f})" for place, scene in enumerate(BY_TEXTURE, 1)]
     assert table.columns == ("Ablation", "Metric", *expected, "rank correlation")
     rows = {row[:2]: row[2:] for row in table.rows}
-    assert rows["a", "PSNR"] == ("+5.00 ↑", "+10.00 ↑", "+15.00 ↑", "+1.00")
-    assert rows["a", "LPIPS"] == ("0.00 =", "0.00 =", "0.00 =", "")
-    assert {metric for _, metric in rows} == {"LPIPS", "SSIM", "PSNR"}
+    assert rows["a", "PSNR, dB"] == ("+1.00 ↑", "+2.00 ↑", "+3.00 ↑", "+1.00")
+    assert rows["a", "LPIPS, %"] == ("0.00 =", "0.00 =", "0.00 =", "")
+    assert {metric for _, metric in rows} == {"LPIPS, %", "SSIM, %", "PSNR, dB"}
 
 
 def test_the_table_says_how_its_scores_were_made(made: Any) -> None:
@@ -172,7 +185,7 @@ def test_the_correlation_is_one_of_ranks(made: Any) -> None:
         made.add("a", scene=scene, values={"psnr": 20.0 + gain})
         draw(made, scene, 10 + place**3)
     (table,) = tables_by_texture(made)
-    assert table.rows[-1][-1] == f"{spearmanr(range(4), gains).statistic:+.2f}"
+    assert table.rows[0][-1] == f"{spearmanr(range(4), gains).statistic:+.2f}"
 
 
 def test_two_scenes_have_no_table(made: Any) -> None:

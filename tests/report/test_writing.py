@@ -10,13 +10,15 @@ from xrgs.evaluation.metrics import METRICS, Metric
 from xrgs.report.writing import (
     Change,
     arrow,
-    false_discovery,
+    interval,
     lacking,
     marked,
+    named,
     number,
-    reading,
-    scatter,
+    p_value,
+    same_sign,
     signed,
+    verdict,
 )
 
 BY_NAME = {metric.name: metric for metric in METRICS}
@@ -25,7 +27,8 @@ BY_NAME = {metric.name: metric for metric in METRICS}
 def change(mean: float, low: float = math.nan, high: float = math.nan, **more: Any) -> Change:
     row: dict[str, Any] = dict.fromkeys(Change._fields, math.nan)
     row |= {"change": mean, "low": low, "high": high, "n": 1 if math.isnan(low) else 3}
-    return Change(**row | {"unit": "replicates", "scenes": 3, "why": ""} | more)
+    row |= {"unit": "replicates", "scenes": 3, "why": "", "outcome": True}
+    return Change(**row | more)
 
 
 @pytest.mark.parametrize("metric", METRICS, ids=lambda metric: metric.name)
@@ -59,6 +62,7 @@ def test_changes_are_signed(value: float, text: str) -> None:
         (999_400_000.0, "", "999 M"),
         (999_600_000.0, "", "1.00 G"),
         (17_901_503_296.0, "", "17.9 G"),
+        (1.302e12, "", "1.30 T"),
         (7.0, "", "7"),
         (0.81234, "", "0.8123"),
         (24.0, "dB", "24.00 dB"),
@@ -71,47 +75,69 @@ def test_values_have_their_unit(value: float, unit: str, text: str) -> None:
     assert number(value, unit) == text
 
 
+SURE = {"low": 1.0, "high": 9.0, "q": 0.01}
+
+
 @pytest.mark.parametrize(
     ("row", "text"),
     [
         (change(5.0), "one replicate: no interval"),
-        (change(5.0, 1.0, 9.0), "better"),
-        (change(-5.0, -9.0, -1.0), "worse"),
-        (change(5.0, -1.0, 11.0), "interval holds 0"),
-        (change(5.0, 0.0, 10.0), "interval holds 0"),
-        (change(0.0, 0.0, 0.0), "unchanged"),
-        (change(0.0, -1.0, 1.0), "interval holds 0"),
-        (change(0.002, 0.001, 0.003), "unchanged"),
+        (change(5.0, **SURE), "better"),
+        (change(-5.0, **SURE), "worse"),
+        (change(5.0, **SURE | {"q": 0.05}), "better"),
+        (change(5.0, **SURE | {"q": 0.051}), "not shown"),
+        (change(5.0, **SURE | {"q": math.nan}), "not shown"),  # two values
+        (change(5.0, **SURE, holm=0.06), "not shown"),
+        (change(5.0, **SURE | {"q": 0.06}, holm=0.05), "better"),
+        (change(5.0, **SURE, p_equivalent=0.05), "equivalent"),  # surely better, by next to nothing
+        (change(5.0, **SURE | {"q": 0.9}, p_equivalent=0.051), "not shown"),
+        (change(5.0, **SURE, outcome=False), "descriptive"),
         (change(math.nan, why="not measured"), "n/a: not measured"),
-        (change(5.0, 1.0, 9.0, n=2), "two values: no verdict"),
-        (change(5.0, -1.0, 11.0, n=2), "two values: no verdict"),
     ],
 )
-def test_what_an_interval_allows_to_be_said_of_psnr(row: Change, text: str) -> None:
-    assert reading(row, BY_NAME["psnr"]) == text
+def test_what_the_tests_allow_to_be_said_of_psnr(row: Change, text: str) -> None:
+    assert verdict(row, BY_NAME["psnr"]) == text
 
 
-def test_less_gaussians_outside_noise_are_better() -> None:
-    assert reading(change(-5.0, -9.0, -1.0), BY_NAME["gaussians"]) == "better"
+def test_less_gaussians_are_better() -> None:
+    assert verdict(change(-5.0, **SURE), BY_NAME["gaussians"]) == "better"
+
+
+@pytest.mark.parametrize(("p", "text"), [(0.0004, "<0.001"), (0.05, "0.050"), (math.nan, "")])
+def test_a_p_has_three_decimals(p: float, text: str) -> None:
+    assert p_value(p) == text
 
 
 @pytest.mark.parametrize(
-    ("q", "text"), [(0.0004, "<0.001 *"), (0.05, "0.050 *"), (0.0501, "0.050"), (math.nan, "")]
+    ("mean", "up", "down", "text"),
+    [(1.0, 3, 1, "3 of 5 (0.625)"), (-1.0, 3, 1, "1 of 5 (0.625)"), (0.0, 2, 1, "2 of 5 (0.625)")],
 )
-def test_a_star_is_where_q_is_at_most_5_percent(q: float, text: str) -> None:
-    assert false_discovery(change(5.0, q=q)) == text
-    assert ("*" in marked(change(5.0, q=q), BY_NAME["psnr"], 3)) == ("*" in text)
+def test_values_are_counted_by_the_sign_of_their_mean(
+    mean: float, up: int, down: int, text: str
+) -> None:
+    assert same_sign(change(mean, up=up, down=down, n=5, p_sign=0.625)) == text
+    assert same_sign(change(mean, up=up, down=down, n=1, p_sign=1.0)) == ""
+
+
+def test_an_interval_has_two_signed_ends() -> None:
+    assert interval(-1.204, 3.4) == "-1.20 to +3.40"
+    assert interval(math.nan, math.nan) == ""
+
+
+def test_a_metric_is_named_with_the_unit_of_its_changes() -> None:
+    names = {named(metric) for metric in METRICS}
+    assert {"PSNR, dB", "PSNR, worst view, dB", "LPIPS, %", "SSIM, %", "Memory, %"} <= names
 
 
 @pytest.mark.parametrize(("scenes", "text"), [(0, ""), (2, " (2 of 3)"), (3, "")])
 def test_a_mean_that_lacks_a_scene_says_so(scenes: int, text: str) -> None:
     assert lacking(change(5.0, scenes=scenes), 3) == text
-    assert marked(change(5.0, scenes=scenes, q=0.01), BY_NAME["psnr"], 3) == f"+5.00 ↑ *{text}"
+    row = change(5.0, **SURE, scenes=scenes)
+    assert marked(row, BY_NAME["psnr"], 3) == f"+5.00 ↑ *{text}"
+    equivalent = row._replace(p_equivalent=0.01)
+    assert marked(equivalent, BY_NAME["psnr"], 3) == f"+5.00 ↑ ≈{text}"
+    assert marked(row._replace(q=0.9), BY_NAME["psnr"], 3) == f"+5.00 ↑{text}"
 
 
 def test_what_is_missing_has_no_mark() -> None:
     assert marked(None, BY_NAME["psnr"], 3) == "missing"
-
-
-def test_a_deviation_has_no_sign() -> None:
-    assert (scatter(1234.567), scatter(math.nan)) == ("1,234.57", "")

@@ -28,6 +28,10 @@ def report(
     pictures: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = ("all",),
     against: Annotated[str, arg(metavar="LABEL")] = BASELINE,
     external: Annotated[tuple[str, ...], shown_as("[LABEL:]FOLDER ...")] = (),
+    outcomes: Names = (),
+    headline: Names = (),
+    margin_psnr: float = 0.2,
+    margin_lpips: float = 5.0,
 ) -> None:
     """Make the tables and figures of a sweep.
 
@@ -46,13 +50,21 @@ def report(
         external: Another program's renders of the test views, as one more label. FOLDER has
             SCENE/VIEW.png, or VIEW.png where there is one scene, as 8-bit RGB of the photograph's
             size.
+        outcomes: The metrics that have a verdict, and whose tests are corrected together; all
+            others are descriptive. Name them before the data. By default psnr, psnr_pooled,
+            psnr_worst, lpips, evaluations and gaussians.
+        headline: The labels of a study's claims: their tests are corrected by Holm.
+        margin_psnr: A change of PSNR that is shown to be smaller is called equivalent, dB.
+        margin_lpips: The same for LPIPS, %.
     """
-    from xrgs.report import Choice, build
+    from xrgs.report import Choice, Design, build
     from xrgs.report.external import parse
 
     drawn = None if pictures == ("all",) else [name for name in pictures if name != "none"]
     choice = Choice(scenes, ablations)
-    say(build(list(store), sweep or None, out, drawn, against, choice, parse(external)).text)
+    design = Design(outcomes or Design.outcomes, headline, margin_psnr, margin_lpips)
+    others = parse(external)
+    say(build(list(store), sweep or None, out, drawn, against, choice, others, design).text)
 
 
 def list_sweeps(store: Folder = STORE) -> None:

@@ -7,6 +7,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import msgspec
+import numpy as np
 import pandas as pd
 
 from xrgs.errors import StoreError, XrgsError
@@ -80,6 +81,29 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, An
             yield key, for_line(value) if isinstance(value, str) else value
 
 
+def over_views(views: pd.DataFrame) -> pd.DataFrame:
+    """Return the scores of each cell.
+
+    `psnr_pooled` is the PSNR of the views' squared errors together, -10 log10(mean(10^(-PSNR/10))),
+    in which each view counts once. A view that is far off counts for more in it than in the mean of
+    PSNR. `psnr_worst` is the lowest PSNR.
+
+    Args:
+        views: One row for each view: `cell_id`, `psnr` in dB, and a column for each other score.
+
+    Returns:
+        One row for each cell, indexed by its id: the mean of each score over the views,
+        `psnr_pooled` and `psnr_worst`. A score that one view lacks is NaN.
+    """
+    errors = 10 ** (-views["psnr"] / 10)
+    grouped = views.assign(psnr_pooled=errors, psnr_worst=views["psnr"]).groupby("cell_id")
+    means = grouped.mean()
+    with np.errstate(divide="ignore"):  # no error at all is infinite PSNR
+        means["psnr_pooled"] = -10 * np.log10(means["psnr_pooled"])
+    means["psnr_worst"] = grouped["psnr_worst"].min()
+    return means.mask(grouped.count().lt(grouped.size(), axis=0))
+
+
 def cell_metrics(summary: Summary, scores: pd.DataFrame) -> dict[str, float]:
     """Return the metrics of a finished cell, by name.
 
@@ -88,10 +112,9 @@ def cell_metrics(summary: Summary, scores: pd.DataFrame) -> dict[str, float]:
         scores: The scores of its views, as `CellFolder.scores` returns them.
 
     Returns:
-        Figures of the whole cell, and the means of scores over the views; a score that one view
-        lacks has no mean (NaN).
+        Figures of the whole cell, and `over_views` of its scores.
     """
-    means = scores.mean(skipna=False)
+    means = over_views(scores.assign(cell_id="")).iloc[0]
     figures = msgspec.structs.asdict(summary)
     whole = {m.name: float(figures[m.name]) for m in METRICS if figures.get(m.name) is not None}
     return whole | {m.name: float(means[m.name]) for m in METRICS if m.name in means}

@@ -19,6 +19,7 @@ from xrgs.evaluation.metrics import METRICS, VIEW_METRICS
 from xrgs.evaluation.scoring import PROTOCOL, stale_scores
 from xrgs.experiment.cell_folder import CellState
 from xrgs.experiment.provenance import machine
+from xrgs.experiment.results import over_views
 from xrgs.runtime.progress import progress
 from xrgs.safeio.records import as_number, read_table
 from xrgs.safeio.sanitize import for_line
@@ -160,7 +161,9 @@ def read_cells(
             columns[cell_id] = {"state": found.name, "reason": found.reason}
     _check_identity("+".join(commands), rows, done)
     views = _views(done)
-    return Sweep(commands, _cells(rows, columns, cell_means(views)), views, done)
+    return Sweep(
+        commands, _cells(rows, columns, over_views(views.drop(columns="view"))), views, done
+    )
 
 
 def _read_cell(cell: CellFolder) -> DoneCell | CellState:
@@ -301,20 +304,6 @@ def _views(done: Mapping[str, DoneCell]) -> pd.DataFrame:
     views = pd.DataFrame(rows, columns=["cell_id", "view", *VIEW_METRICS])
     texts: dict[str, Any] = {"cell_id": object, "view": object}
     return views.astype(texts | dict.fromkeys(VIEW_METRICS, np.float64))
-
-
-def cell_means(views: pd.DataFrame) -> pd.DataFrame:
-    """Return the mean of each score over a cell's views, NaN where one view lacks the score.
-
-    Args:
-        views: The table `Sweep.views`.
-
-    Returns:
-        One row a cell, indexed by its id, with a column for each score.
-    """
-    grouped = views.drop(columns="view").groupby("cell_id")
-    means: pd.DataFrame = grouped.mean()
-    return means.mask(grouped.count().lt(grouped.size(), axis=0))
 
 
 def _cells(

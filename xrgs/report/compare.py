@@ -4,21 +4,24 @@ The base is the baseline, or any other label of the sweep. A pair is a cell and 
 scene, condition and replicate. A replicate is a value of `variant.seed`, which draws the HR views,
 and a value of `seed`, which training uses: both cells of a pair have the same variant and seed.
 
-Scores of views are compared by the change 100 (value - base) / |base|, as in the paper's Table 1.
-Amounts (times, counts, memory) are compared by log(value / base). Their means and intervals become
-percent at the end: 100 (exp(mean) - 1). A scene's change is the mean over its replicates, and the
-sweep's change is the mean over scenes, in which each scene counts once.
+PSNR is compared by its difference in dB. Every other metric is above zero and is compared by
+log(value / base), whose means and intervals become percent at the end: 100 (exp(mean) - 1). A
+scene's change is the mean over its replicates, and the sweep's change is the mean over scenes, in
+which each scene counts once.
 
 Times are compared where both cells were trained on the same machine, with as many threads, and no
 other machine continued either. A score is compared where the same code has computed both values.
 
 The 95 % interval is Student's t around the mean. With several scenes it is over the scenes' means:
 it says how far the mean would move with other scenes like these, and includes the noise between
-replicates. With one scene it is over replicates. One scene with one replicate has no interval. The
-tables also say how many of the pairs changed in the direction of the mean, and the standard
-deviations of the replicates, pooled over the scenes, and of the scenes' means. The p of the t-test
-that belongs to the interval gives Benjamini and Hochberg's q, over all ablations and metrics of a
-condition.
+replicates. The interval for a new scene says where the mean over the replicates of one more such
+scene would be. With one scene the interval is over replicates. One scene with one replicate has no
+interval.
+
+Verdicts are for the outcomes that a `Design` names, and all other metrics are descriptive. The p of
+the t-tests of the outcomes are corrected together, over all ablations of a condition. Amounts are
+corrected apart from scores: nearly every ablation changes an amount, and such tests would make room
+for false discoveries among the scores.
 
 A condition may have `all_hr`, which trains on the originals of the degraded photographs. A pair
 then closes a share of the gap, 100 (value - base) / (all_hr - base), of the three cells of one
@@ -42,17 +45,21 @@ from xrgs.report.inference import (
     ALL_HR,
     OTHER_CODE,
     OTHER_MACHINE,
+    difference,
+    equivalence,
+    false_discovery_rates,
+    holm,
     log_ratio,
-    percent_change,
     share_of_gap,
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
     from xrgs.evaluation.metrics import Metric
+    from xrgs.report.inference import Floats
 
 _GROUP = ["label", "condition"]
 #: The units of the metrics that depend on the machine.
@@ -61,15 +68,46 @@ _TIMES = frozenset({"s", "ms"})
 _PAIR = ["scene", "condition", "variant_seed", "seed"]
 
 
-def is_amount(metric: Metric) -> bool:
-    """Return whether a metric is an amount above zero (time, count, memory): compared by ratio."""
-    return metric.score is None
+@dataclass(frozen=True)
+class Design:
+    """What a comparison tests, and how small a change does not matter: named before the data."""
+
+    outcomes: tuple[str, ...] = (
+        *("psnr", "psnr_pooled", "psnr_worst", "lpips"),
+        *("evaluations", "gaussians"),
+    )
+    """Names of the metrics that have a verdict, in the order of the tables."""
+    headline: tuple[str, ...] = ()
+    """Labels whose tests are corrected by Holm: what a study claims of each of them."""
+    margin_psnr: float = 0.2
+    """The largest change of PSNR that counts as none, dB; our choice."""
+    margin_lpips: float = 5.0
+    """The largest change of LPIPS that counts as none, %; our choice."""
+
+    def margin(self, metric: Metric) -> float:
+        """Return the margin of a metric, in the scale of its effect; 0 where it has none."""
+        if metric.unit == "dB":
+            return self.margin_psnr
+        return float(np.log1p(self.margin_lpips / 100)) if metric.name == "lpips" else 0.0
+
+
+def scored_by(metric: Metric) -> str:
+    """Return the score of views that a metric is, or follows from; empty for an amount."""
+    if metric.score is None:
+        return "psnr" if metric.unit == "dB" else ""
+    return metric.name
+
+
+def is_ratio(metric: Metric) -> bool:
+    """Return whether a metric is compared by ratio, and shown in percent; else it is in dB."""
+    return metric.unit != "dB"
 
 
 @dataclass(frozen=True)
 class Comparison:
     """Every number of a report's tables."""
 
+    design: Design
     base: str
     """The label that all others are compared with."""
     metrics: tuple[Metric, ...]
@@ -82,13 +120,14 @@ class Comparison:
     another machine has trained that cell, as far as is known. The reason of an ablation without a
     finished base says so."""
     pairs: pd.DataFrame
-    """One row for each metric of each ablation's cell: `base`, `value`, `effect` (the log of their
-    ratio, or the change in %), `difference` (in the metric's unit) and `why` there is no effect."""
+    """One row for each metric of each ablation's cell: `base`, `value`, `effect` (their difference
+    in dB, or the log of their ratio) and `why` there is no effect."""
     per_scene: pd.DataFrame
     """Means over replicates, indexed by label, condition, scene, metric; its columns are described
     in `xrgs.report.averages.averaged`."""
     means: pd.DataFrame
-    """Means over scenes, indexed by label, condition, metric."""
+    """Means over scenes, indexed by label, condition, metric. Of an `outcome` there are `q`
+    (Benjamini and Hochberg), `holm` for headline labels, and `p_equivalent` of the TOST."""
     gaps_per_scene: pd.DataFrame
     """As `per_scene`, with the share of the gap to all_hr (%) as the `change`: a row for each score
     and ablation in the conditions that have all_hr."""
@@ -100,34 +139,46 @@ class Comparison:
         return self.cells[self.cells["reason"] != ""]
 
 
-def compare(cells: pd.DataFrame, metrics: Sequence[Metric], against: str = BASELINE) -> Comparison:
+def compare(
+    cells: pd.DataFrame,
+    metrics: Sequence[Metric],
+    against: str = BASELINE,
+    design: Design | None = None,
+) -> Comparison:
     """Pair every ablation with its base and average over replicates, then over scenes.
 
     Args:
         cells: The table `Sweep.cells`.
-        metrics: The metrics to compare, in the order of the tables' rows. An optional one that no
-            cell has is left out.
+        metrics: The metrics to compare. An optional one that no cell has is left out. Outcomes come
+            first in the tables, and the others follow in this order.
         against: The label that all others are compared with.
+        design: The outcomes, headline labels and margins; None takes the defaults.
 
     Returns:
         The pairs, and their means over replicates and over scenes.
 
     Raises:
-        ReportError: The sweep has no such label; a cell's baseline is of another scene, variant or
-            seed, or is not in the sweep; cells of one scene, condition and `variant.seed` are of
-            different variants; the cells were scored by different evaluation protocols; or some
-            cells of a condition were scored on held-out training views and others were not. The
-            message names both cells, or the labels.
+        ReportError: The sweep has no such label, or there is no such metric; a cell's baseline is
+            of another scene, variant or seed, or is not in the sweep; cells of one scene, condition
+            and `variant.seed` are of different variants; the cells were scored by different
+            evaluation protocols; or some cells of a condition were scored on held-out training
+            views and others were not. The message names both cells, or what to choose from.
     """
-    metrics = [m for m in metrics if not m.optional or cells[m.name].notna().any()]
+    design = design or Design()
+    _check_design(design, metrics, cells)
+    order = {name: at for at, name in enumerate(design.outcomes)}
+    metrics = sorted(
+        (m for m in metrics if not m.optional or cells[m.name].notna().any()),
+        key=lambda metric: order.get(metric.name, len(order)),
+    )
     cells = _with_base(cells, against)
     _check_comparable(cells, against)
     pairs = _pairs(cells, metrics, against)
-    amounts = [metric.name for metric in metrics if is_amount(metric)]
-    per_scene, means = averaged(pairs, amounts)
+    per_scene, means = averaged(pairs, [metric.name for metric in metrics if is_ratio(metric)])
     gaps_per_scene, gaps = averaged(_gaps(pairs, cells, metrics, against), ())
     ablations = cells[cells["label"] != against]
     return Comparison(
+        design=design,
         base=against,
         metrics=tuple(metrics),
         scenes=tuple(sorted(cells["scene"].unique())),
@@ -135,9 +186,43 @@ def compare(cells: pd.DataFrame, metrics: Sequence[Metric], against: str = BASEL
         cells=cells,
         pairs=pairs,
         per_scene=per_scene,
-        means=means,
+        means=_tested(means, metrics, design),
         gaps_per_scene=gaps_per_scene,
         gaps=gaps,
+    )
+
+
+def _check_design(design: Design, metrics: Sequence[Metric], cells: pd.DataFrame) -> None:
+    """Raise ReportError for an outcome that is no metric, and a headline that is no label."""
+    for key, kind, wanted, known in (
+        ("outcomes", "metric", design.outcomes, [metric.name for metric in metrics]),
+        ("headline", "label", design.headline, list(dict.fromkeys(cells["label"]))),
+    ):
+        if unknown := [name for name in wanted if name not in known]:
+            names = ", ".join(known)
+            raise ReportError(f"{key}={unknown[0]}: there is no such {kind}; choose from: {names}")
+
+
+def _tested(means: pd.DataFrame, metrics: Sequence[Metric], design: Design) -> pd.DataFrame:
+    """Return the means with the corrected tests of the outcomes, see `Comparison.means`."""
+    by_name = {metric.name: metric for metric in metrics}
+    of = [by_name[name] for name in means.index.get_level_values("metric")]
+    outcome = np.array([metric.name in design.outcomes for metric in of], dtype=bool)
+    headline = means.index.get_level_values("label").isin(design.headline)
+    amount = np.array([not scored_by(metric) for metric in of], dtype=bool)
+    families = [means.index.get_level_values("condition"), amount]
+    margin = np.array([design.margin(metric) for metric in of], dtype=np.float64)
+    effect, spread, n = (means[name].to_numpy(np.float64) for name in ("effect", "spread", "n"))
+
+    def corrected(chosen: NDArray[np.bool_], correct: Callable[[Floats], Floats]) -> pd.Series:
+        p = means["p"].where(chosen)
+        return p.groupby(families).transform(lambda of: correct(of.to_numpy(np.float64)))
+
+    return means.assign(
+        outcome=outcome,
+        q=corrected(outcome, false_discovery_rates),
+        holm=corrected(outcome & headline, holm),
+        p_equivalent=np.where(outcome, equivalence(effect, spread, n, margin), np.nan),
     )
 
 
@@ -240,22 +325,13 @@ def _pairs(cells: pd.DataFrame, metrics: Sequence[Metric], against: str) -> pd.D
     for metric in metrics:
         base = matched[metric.name].to_numpy(np.float64)
         value = paired[metric.name].to_numpy(np.float64)
-        effect, why = (log_ratio if is_amount(metric) else percent_change)(base, value)
+        effect, why = (log_ratio if is_ratio(metric) else difference)(base, value)
         incomparable, reason = _incomparable(metric, paired, matched)
         effect = np.where(incomparable, np.nan, effect)
         why = np.where(incomparable & (why == ""), reason, why)
-        with np.errstate(invalid="ignore"):  # inf - inf gives NaN, as it should
-            difference = value - base
         part = paired[[*_GROUP, "scene", "variant_seed", "seed", "cell_id", "base_id"]]
         parts.append(
-            part.assign(
-                metric=metric.name,
-                base=base,
-                value=value,
-                effect=effect,
-                difference=difference,
-                why=why,
-            )
+            part.assign(metric=metric.name, base=base, value=value, effect=effect, why=why)
         )
     return pd.concat(parts, ignore_index=True)
 
@@ -264,8 +340,8 @@ def _incomparable(
     metric: Metric, paired: pd.DataFrame, matched: pd.DataFrame
 ) -> tuple[NDArray[np.bool_], str]:
     """Return which pairs have values of a metric that can't be compared, and why."""
-    if not is_amount(metric):
-        code = f"{metric.name}_code"
+    if score := scored_by(metric):
+        code = f"{score}_code"
         return paired[code].to_numpy(str) != matched[code].to_numpy(str), OTHER_CODE
     return paired["elsewhere"].to_numpy(bool) & (metric.unit in _TIMES), OTHER_MACHINE
 
@@ -274,7 +350,7 @@ def _gaps(
     pairs: pd.DataFrame, cells: pd.DataFrame, metrics: Sequence[Metric], against: str
 ) -> pd.DataFrame:
     """Return the pairs of scores in conditions with all_hr; the effect is the share of the gap."""
-    scores = {m.name: m.higher_is_better for m in metrics if not is_amount(m)}
+    scores = {m.name: m.higher_is_better for m in metrics if m.score is not None}
     conditions = cells.loc[cells["label"].isin({ALL_HR} - {against}), "condition"].unique()
     rows = pairs[pairs["metric"].isin(scores) & pairs["condition"].isin(conditions)]
     replicate = ["condition", "base_id", "metric"]

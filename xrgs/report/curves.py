@@ -112,10 +112,12 @@ def times(cells: pd.DataFrame, done: Mapping[str, DoneCell]) -> pd.DataFrame:
 
     Returns:
         One row for each cell that was evaluated during training and has a base that is done:
-        `CELL_KEYS`; `target`, the base's final PSNR of this scene and replicate, dB; `seconds` and
-        `evaluations` until the mean PSNR of the test views first reaches the target; and
-        `seconds_share` and `evaluations_share` of the base's totals. They are NaN where the target
-        is not reached. A time of another machine than the base's has no share.
+        `CELL_KEYS`; `target`, the base's final PSNR of this scene and replicate, dB; `evaluations`
+        and `seconds` until the mean PSNR of the test views first reaches the target. Of both there
+        is the `_share` of the base's whole training, and the `_own_share` of what the base itself
+        takes until it first reaches its final PSNR: it may pass that PSNR early and fall again.
+        They are NaN where the target is not reached. A time of another machine than the base's has
+        no share.
     """
     rows = []
     for _, cell in cells[cells["cell_id"].isin(done)].drop_duplicates(CELL_KEYS).iterrows():
@@ -124,23 +126,31 @@ def times(cells: pd.DataFrame, done: Mapping[str, DoneCell]) -> pd.DataFrame:
             continue
         end = base.curve[-1]
         row = dict(cell[CELL_KEYS]) | {"target": end["psnr"]}
-        for name in ("seconds", "evaluations"):
-            quality, amounts = ([at[key] for at in curve] for key in ("psnr", name))
-            row[name] = first_reaches(quality, amounts, end["psnr"])
-            row[f"{name}_share"] = row[name] / end[name] if end[name] else math.nan
-        if cell["elsewhere"]:
-            row["seconds_share"] = math.nan
+        for name in ("evaluations", "seconds"):
+            row[name], own = (_first_passage(of, name, end["psnr"]) for of in (curve, base.curve))
+            comparable = not (cell["elsewhere"] and name == "seconds")
+            for share, whole in (("share", end[name]), ("own_share", own)):
+                known = comparable and whole > 0
+                row[f"{name}_{share}"] = row[name] / whole if known else math.nan
         rows.append(row)
     return pd.DataFrame(rows, columns=[*CELL_KEYS, "target", *_ROWS])
+
+
+def _first_passage(curve: Sequence[Mapping[str, float]], name: str, target: float) -> float:
+    """Return the time or work after which a curve first has a PSNR."""
+    quality, amounts = ([at[key] for at in curve] for key in ("psnr", name))
+    return first_reaches(quality, amounts, target)
 
 
 #: The rows of a table for each column of `times`: name, where `{base}` stands for the label of the
 #: base, and factor and format of the number.
 _ROWS = {
-    "seconds": ("Time, s", 1.0, ",.1f"),
-    "seconds_share": ("Time, % of {base}'s", 100.0, ".0f"),
     "evaluations": ("Alpha evaluations, 10^9", 1e-9, ",.3g"),
-    "evaluations_share": ("Alpha evaluations, % of {base}'s", 100.0, ".0f"),
+    "evaluations_share": ("% of {base}'s whole training", 100.0, ".0f"),
+    "evaluations_own_share": ("% of {base}'s own first passage", 100.0, ".0f"),
+    "seconds": ("Time, s", 1.0, ",.1f"),
+    "seconds_share": ("time, % of {base}'s whole training", 100.0, ".0f"),
+    "seconds_own_share": ("time, % of {base}'s own first passage", 100.0, ".0f"),
 }
 
 
@@ -161,7 +171,7 @@ def table(found: pd.DataFrame, labels: Sequence[str], condition: str, base: str)
         shares = [name for name in _ROWS if name.endswith("_share")]
         rows += _rows_of("mean over scenes", scenes.reset_index(), labels, shares, base)
     return TextTable(
-        title=titled(f"Time and work to the PSNR at which {base} ends", condition),
+        title=titled(f"Work and time to the PSNR at which {base} ends", condition),
         columns=("Scene", "", *labels),
         rows=tuple(rows),
         align="ll" + "r" * len(labels),
@@ -170,6 +180,7 @@ def table(found: pd.DataFrame, labels: Sequence[str], condition: str, base: str)
             " same scene and replicate, linear between two evaluations; mean over the runs of a"
             " scene",
             "a run that reaches it before its first evaluation has the time of that evaluation",
+            f"own first passage: where {base} itself first reaches that PSNR; it may fall again",
         ),
     )
 
@@ -196,7 +207,7 @@ def _text(rows: pd.DataFrame | None, name: str) -> str:
     """Return a mean, or why there is none; empty where there is no row."""
     if rows is None:
         return ""
-    reached = int(rows[name.removesuffix("_share")].notna().sum())
+    reached = int(rows[name.partition("_")[0]].notna().sum())
     if reached < len(rows):
         return (
             _NOT_REACHED if reached == 0 else f"{_NOT_REACHED} {len(rows) - reached} of {len(rows)}"

@@ -18,7 +18,8 @@ from xrgs.capture.images import ImageError
 from xrgs.evaluation.files import score_file
 from xrgs.evaluation.metrics import VIEW_METRICS
 from xrgs.evaluation.scoring import scoring_code
-from xrgs.report.collect import ReportError, Sweep, cell_means
+from xrgs.experiment.results import over_views
+from xrgs.report.collect import ReportError, Sweep
 from xrgs.runtime.progress import progress
 from xrgs.safeio.files import is_inside
 from xrgs.safeio.paths import user_path
@@ -122,12 +123,12 @@ def _with_one(sweep: Sweep, store: JoinedStore, one: External) -> Sweep:
             | {"cell_id": cell_id, "label": one.label, "state": "done"}
             | dict.fromkeys(("reason", "stale", "machine"), "")
         )
-    means = cell_means(pd.DataFrame(scores, columns=list(sweep.views.columns)))
+    views = pd.DataFrame(scores, columns=list(sweep.views.columns)).astype(sweep.views.dtypes)
+    means = over_views(views.drop(columns="view"))
     added = pd.DataFrame(rows, columns=list(sweep.cells.columns))
     for name in means.columns:
         added[name] = added["cell_id"].map(means[name])
     cells = pd.concat([sweep.cells, added.astype(sweep.cells.dtypes)], ignore_index=True)
-    views = pd.DataFrame(scores, columns=list(sweep.views.columns)).astype(sweep.views.dtypes)
     both = pd.concat([sweep.views, views], ignore_index=True)
     return replace(sweep, cells=cells, views=both, renders=renders)
 

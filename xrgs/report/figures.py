@@ -19,6 +19,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import EngFormatter, LogLocator, NullLocator
 
 from xrgs.capture.images import SOFTWARE
+from xrgs.report.writing import named
 from xrgs.safeio.sanitize import MAX_CELL, for_line
 
 if TYPE_CHECKING:
@@ -311,7 +312,7 @@ def dependence(title: str, key: str, changes: pd.DataFrame, axes: Sequence[Metri
         ]
         _scaled(panel, sorted(rows["value"].unique()))
         panel.axhline(0, color=_BASELINE, linewidth=1.3, linestyle="--")
-        panel.set_title(f"{metric.label}, %", fontsize=10)
+        panel.set_title(named(metric), fontsize=10)
         panel.set_xlabel(for_line(key, _MAX_NAME))
         _with_grid(panel)
         if not metric.higher_is_better:

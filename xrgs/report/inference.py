@@ -1,7 +1,7 @@
-"""The statistics of a report: changes of pairs, Student's intervals and tests, false discoveries.
+"""The statistics of a report: changes of pairs, intervals, tests, and corrections for many tests.
 
 All functions take and return float64 arrays [N], one element for each pair or mean. A number that
-can't be computed is NaN, and a reason says why.
+can't be computed is NaN; of a change of a pair, a reason says why.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.special import stdtr, stdtrit
+from scipy.special import bdtr, stdtr, stdtrit
 from scipy.stats import false_discovery_control
 
 if TYPE_CHECKING:
@@ -21,12 +21,11 @@ CONFIDENCE = 0.95
 #: The fewest values behind a mean that a verdict or a test may rest on: our choice. Two values show
 #: too little of their scatter: Student's interval of them is 13 times as wide as they are apart.
 MIN_VALUES = 3
-#: The rate of false discoveries up to which a change is marked: our choice, as usual.
-FALSE_DISCOVERIES = 0.05
+#: The corrected p up to which a change counts as shown, and the p of the test of equivalence.
+LEVEL = 0.05
 NOT_MEASURED = "not measured"
 OTHER_MACHINE = "timed on another machine"
 OTHER_CODE = "scored by other code"
-ZERO_BASE = "compared with zero"
 NOT_FINITE = "not finite"
 NOT_POSITIVE = "not above zero"
 
@@ -37,62 +36,56 @@ NO_GAP = f"{ALL_HR} has the same value"
 WRONG_GAP = f"{ALL_HR} is worse"
 
 
-def percent_change(base: Floats, value: Floats) -> tuple[Floats, NDArray[np.str_]]:
-    """Return the change 100 (value - base) / |base|.
-
-    The magnitude is taken so that a larger value is a positive change below zero as well: SSIM and
-    PSNR can be negative.
+def difference(base: Floats, value: Floats) -> tuple[Floats, NDArray[np.str_]]:
+    """Return value - base, the change of a metric in dB.
 
     Args:
         base: [N] values of the base.
         value: [N] values of the ablation, in the same unit.
 
     Returns:
-        The changes in percent [N], and why there is none [N], empty where there is one.
-
-    Examples:
-        >>> percent_change(np.array([20.0, 0.0]), np.array([25.0, 1.0]))[0]
-        array([25., nan])
+        The differences [N], and why there is none [N], empty where there is one.
     """
     with np.errstate(all="ignore"):
-        change = 100 * (value - base) / np.abs(base)
-    change = np.where((base == 0) & (value == 0), 0.0, change)
+        change = value - base
     why = np.select(
-        [
-            np.isnan(base) | np.isnan(value),
-            np.isfinite(value) & (base == 0) & (value != 0),
-            ~np.isfinite(change),
-        ],
-        [NOT_MEASURED, ZERO_BASE, NOT_FINITE],
+        [np.isnan(base) | np.isnan(value), ~np.isfinite(change)],
+        [NOT_MEASURED, NOT_FINITE],
         default="",
     )
     return np.where(why == "", change, np.nan), why
 
 
 def log_ratio(base: Floats, value: Floats) -> tuple[Floats, NDArray[np.str_]]:
-    """Return log(value / base), the change of an amount that is above zero.
+    """Return log(value / base), the change of a number that is above zero.
 
     Halving and doubling are then changes of the same size with a mean of 0, and an interval never
     reaches below -100 %.
 
     Args:
-        base: [N] amounts of the base.
-        value: [N] amounts of the ablation, in the same unit.
+        base: [N] values of the base.
+        value: [N] values of the ablation, in the same unit.
 
     Returns:
-        The logarithms [N], and why there is none [N], empty where there is one. Equal amounts have
-        0, also where both are zero.
+        The logarithms [N], and why there is none [N], empty where there is one. Equal finite values
+        have 0, whatever their sign.
 
     Examples:
         >>> log_ratio(np.array([2.0, 2.0]), np.array([2.0, 0.0]))[0]
         array([ 0., nan])
     """
-    _, why = percent_change(base, value)
-    positive = (base > 0) & (value > 0)
-    why = np.where((why == "") & ~positive & (base != value), NOT_POSITIVE, why)
     with np.errstate(all="ignore"):
         ratio = np.where(base == value, 0.0, np.log(value / base))
-    why = np.where((why == "") & ~np.isfinite(ratio), NOT_FINITE, why)
+    why = np.select(
+        [
+            np.isnan(base) | np.isnan(value),
+            np.isinf(base) | np.isinf(value),
+            (base != value) & ((base <= 0) | (value <= 0)),
+            ~np.isfinite(ratio),
+        ],
+        [NOT_MEASURED, NOT_FINITE, NOT_POSITIVE, NOT_FINITE],
+        default="",
+    )
     return np.where(why == "", ratio, np.nan), why
 
 
@@ -147,6 +140,21 @@ def half_width(spread: Floats, n: Floats) -> Floats:
         return np.asarray(stdtrit(n - 1, 0.5 + CONFIDENCE / 2) * spread / np.sqrt(n))
 
 
+def prediction_half_width(spread: Floats, n: Floats) -> Floats:
+    """Return half the width of the 95 % interval for one more value, around the mean of n values.
+
+    It is t s sqrt(1 + 1 / n), of n - 1 degrees of freedom, for values of a normal distribution.
+
+    Args:
+        spread: [N] sample standard deviations, with n - 1 in the denominator.
+        n: [N] number of values behind each mean.
+
+    Returns:
+        [N] in the unit of `spread`; NaN for fewer than `MIN_VALUES`.
+    """
+    return np.where(n >= MIN_VALUES, half_width(spread, n) * np.sqrt(n + 1), np.nan)
+
+
 def p_values(mean: Floats, spread: Floats, n: Floats) -> Floats:
     """Return the p of Student's two-sided test, of each mean, that the true mean is 0.
 
@@ -158,11 +166,74 @@ def p_values(mean: Floats, spread: Floats, n: Floats) -> Floats:
         n: [N] number of values behind each mean.
 
     Returns:
-        [N]; 1 where all values are 0, and NaN for fewer than `MIN_VALUES`.
+        [N]; NaN for fewer than `MIN_VALUES`, and where all values are 0: nothing has changed.
     """
     with np.errstate(all="ignore"):
         p = 2 * stdtr(n - 1, -np.abs(mean) / spread * np.sqrt(n))
-    return np.where(n >= MIN_VALUES, np.where(mean == 0, 1.0, p), np.nan)
+    return np.where(n >= MIN_VALUES, p, np.nan)
+
+
+def sign_test(up: Floats, down: Floats) -> Floats:
+    """Return the p of the exact two-sided sign test, that both signs are equally likely.
+
+    Args:
+        up: [N] numbers of values above 0.
+        down: [N] numbers of values below 0. Values of 0 are left out, as is usual.
+
+    Returns:
+        [N]; 1 where there is no value.
+    """
+    n = (up + down).astype(np.int64)
+    return np.asarray(np.minimum(1.0, 2 * bdtr(np.minimum(up, down), n, 0.5)))
+
+
+def equivalence(mean: Floats, spread: Floats, n: Floats, margin: Floats) -> Floats:
+    """Return the p of two one-sided t-tests (TOST), that the true mean is not within the margin.
+
+    At 0.05 it shows a mean within the margin just where the 90 % interval is within it.
+
+    Args:
+        mean: [N] means.
+        spread: [N] sample standard deviations, with n - 1 in the denominator, in the same unit.
+        n: [N] number of values behind each mean.
+        margin: [N] in the same unit, at least 0: what is smaller does not matter.
+
+    Returns:
+        [N], NaN for fewer than `MIN_VALUES`. Equal values are within the margin (0) or not (1).
+
+    Source: [schuirmann1987].
+    """
+    beyond = np.abs(mean) - margin
+    with np.errstate(all="ignore"):
+        p = np.where(spread > 0, stdtr(n - 1, beyond / spread * np.sqrt(n)), beyond > 0)
+    return np.where(n >= MIN_VALUES, p, np.nan)
+
+
+def holm(p: Floats) -> Floats:
+    """Return Holm's corrected p of each test.
+
+    The chance that any true null hypothesis has a corrected p of at most 0.05 is at most 5 %,
+    however the tests depend on one another. Of the m tests sorted by p, the i-th has the maximum of
+    (m - j + 1) p_j over j <= i.
+
+    Args:
+        p: [N] values of p; NaN where there is no test, which does not count among the m.
+
+    Returns:
+        [N], NaN where p is.
+
+    Source: [holm1979].
+
+    Examples:
+        >>> holm(np.array([0.02, 0.9, np.nan, 0.01]))
+        array([0.04, 0.9 ,  nan, 0.03])
+    """
+    order = np.argsort(p)  # NaN is last
+    m = np.count_nonzero(~np.isnan(p))
+    corrected = np.full_like(p, np.nan)
+    ranked = np.maximum.accumulate(np.arange(m, 0, -1) * p[order[:m]])
+    corrected[order[:m]] = np.minimum(1.0, ranked)
+    return corrected
 
 
 def false_discovery_rates(p: Floats) -> Floats:

@@ -14,7 +14,7 @@ from xrgs.experiment.provenance import MACHINE_KEYS
 from xrgs.experiment.store import BASELINE, Store
 from xrgs.report import curves, work
 from xrgs.report.collect import CELL_KEYS, RECORD_KEYS, ReportError, Sweep, read_cells
-from xrgs.report.compare import compare
+from xrgs.report.compare import Design, compare
 from xrgs.report.context import contexts, decided_by_one_view
 from xrgs.report.external import with_external
 from xrgs.report.html import write_document
@@ -24,6 +24,7 @@ from xrgs.report.paper import paper_tables, texture_tables, with_texture
 from xrgs.report.photographs import photographs, with_variants
 from xrgs.report.pictures import Picture, draw
 from xrgs.report.tables import Tables
+from xrgs.report.writing import legend
 from xrgs.runtime.text import TextTable, to_text
 from xrgs.safeio.atomic import write_json, write_text
 from xrgs.safeio.sanitize import counted, for_csv, for_file_name, for_line, for_markdown
@@ -113,6 +114,7 @@ def build(
     against: str = BASELINE,
     choice: Choice = _EVERYTHING,
     externals: Sequence[External] = (),
+    design: Design | None = None,
 ) -> Report:
     """Write the tables, scores and figures of a sweep, or of several that are joined.
 
@@ -128,6 +130,7 @@ def build(
         choice: Which scenes and ablations of the sweeps the report has.
         externals: Renders of other programs; each becomes one more label. The default folder's name
             then ends with `.with-<label>` for each.
+        design: What the tables test; None takes the defaults.
 
     Returns:
         The report: its text and its files.
@@ -148,7 +151,7 @@ def build(
     sweep = with_external(sweep, store, externals)
     store = replace(store, external=sweep.renders)
     sweep = replace(sweep, views=with_texture(store, sweep.cells, sweep.views))
-    tables = _tables(sweep, against)
+    tables = _tables(sweep, against, design)
     name = _folder_name(ids, choice, against, externals)
     folder = out if out else store.stores[0].reports / name
     try:
@@ -164,9 +167,9 @@ def build(
     return Report(text=text, folder=folder, files=tuple(sorted(written)))
 
 
-def _tables(sweep: Sweep, against: str) -> Tables:
+def _tables(sweep: Sweep, against: str, design: Design | None) -> Tables:
     """Compare the cells of a sweep."""
-    comparison = compare(sweep.cells, METRICS, against)
+    comparison = compare(sweep.cells, METRICS, against, design)
     return Tables(comparison, contexts(sweep), decided_by_one_view(comparison, sweep.views))
 
 
@@ -256,7 +259,7 @@ def _csv(table: pd.DataFrame) -> str:
 def _change_tables(tables: Tables) -> list[TextTable]:
     """Return every table of changes and values, overviews first."""
     comparison = tables.comparison
-    result = [*_overviews(tables), *_ablation_tables(tables)]
+    result = [*_overviews(tables), legend(comparison), *_ablation_tables(tables)]
     conditions = dict.fromkeys(comparison.cells["condition"])
     result += [tables.scores(name) for name in conditions]
     result += [tables.values(name) for name in conditions]
@@ -390,7 +393,9 @@ def _text(tables: Tables, warnings: list[str]) -> str:
     printed = _overviews(tables)
     if len(comparison.groups) <= _MAX_PRINTED_ABLATIONS:
         printed += _ablation_tables(tables)
-    if not comparison.groups:
+    if comparison.groups:
+        printed.append(legend(comparison))
+    else:
         printed += [tables.values(name) for name in dict.fromkeys(comparison.cells["condition"])]
     missing = tables.missing()
     if missing:

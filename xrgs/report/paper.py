@@ -19,18 +19,18 @@ from xrgs.capture.images import ImageError
 from xrgs.errors import StoreError, UnreadableError
 from xrgs.experiment.store import BASELINE
 from xrgs.experiment.trimming import check_images
-from xrgs.report.compare import is_amount
+from xrgs.report.averages import averaged
+from xrgs.report.compare import is_ratio
 from xrgs.report.context import context_of
-from xrgs.report.inference import MIN_VALUES
+from xrgs.report.inference import MIN_VALUES, log_ratio
 from xrgs.report.markup import filled, titled
 from xrgs.report.writing import (
-    ARROWS_NOTE,
-    agreement,
-    agreement_note,
     by_key,
     interval,
     lacking,
-    percent,
+    named,
+    pointed,
+    same_sign,
     signed,
 )
 from xrgs.runtime.progress import progress
@@ -104,6 +104,13 @@ _TABLE_2 = (
 )
 
 
+#: Metrics that the paper has a number of, and why ours is of another quantity.
+_NOT_COMPARABLE = {
+    "memory_bytes": "the paper probably has gsplat's number, which is what torch allocates on the"
+    " GPU, without the photographs; here every tensor that training holds is counted"
+}
+
+
 def paper_tables(comparison: Comparison, contexts: Mapping[str, Context]) -> list[TextTable]:
     """Return the paper's tables beside the changes of full XR-GS from the baseline.
 
@@ -113,7 +120,8 @@ def paper_tables(comparison: Comparison, contexts: Mapping[str, Context]) -> lis
     """
     if comparison.base != BASELINE:
         return []
-    means, per_scene = by_key(comparison.means), by_key(comparison.per_scene)
+    names = [metric.name for metric in comparison.metrics]
+    per_scene, means = map(by_key, averaged(_as_ratios(comparison), names))
     tables = []
     for condition in dict.fromkeys(condition for _, condition in comparison.groups):
         context = context_of(contexts, condition).of_all
@@ -128,6 +136,17 @@ def paper_tables(comparison: Comparison, contexts: Mapping[str, Context]) -> lis
                 }
                 tables.append(_beside(comparison, condition, column, here, scene, context))
     return [table for table in tables if table.rows]
+
+
+def _as_ratios(comparison: Comparison) -> pd.DataFrame:
+    """Return the pairs with log(value / base) as the effect of PSNR too: the paper has percent."""
+    pairs = comparison.pairs
+    in_db = {metric.name for metric in comparison.metrics if not is_ratio(metric)}
+    rows = pairs["metric"].isin(in_db) & pairs["effect"].notna()
+    effect, why = log_ratio(*(pairs[name].to_numpy(np.float64) for name in ("base", "value")))
+    return pairs.assign(
+        effect=np.where(rows, effect, pairs["effect"]), why=np.where(rows, why, pairs["why"])
+    )
 
 
 def _beside(
@@ -148,19 +167,23 @@ def _beside(
         and (found := changes.get((label, condition, metric.name))) is not None
     ]
     of = scene or f"mean over {counted(scenes, 'scene')}"
+    metrics = [metric for metric in comparison.metrics if metric.name in column.changes]
     table = TextTable(
         title=titled(f"Beside {column.title}: {of}", condition),
         columns=(
-            *("XR-GS", "Metric", "paper, %", f"change from {BASELINE}, %", "95 % interval, %"),
-            *("pairs that agree", "the paper's sign is"),
+            *("XR-GS", "Metric", "paper, %", "here, %", "95 % interval"),
+            *("here / paper", "same sign (p)", "the paper's sign is"),
         ),
         rows=tuple(rows),
-        align="llrrrrl",
+        align="llrrrrrl",
         notes=(
-            "confirmed: the interval is on the paper's side of 0; refuted: it is on the other side;"
-            " open: it holds 0, or there is none",
-            ARROWS_NOTE,
-            *agreement_note(changes.values()),
+            "confirmed: the 95 % interval is on the paper's side of 0; refuted: it is on the other"
+            " side; open: it holds 0, or there is none",
+            *(
+                f"{metric.label} is not comparable: {_NOT_COMPARABLE[metric.name]}"
+                for metric in metrics
+                if metric.name in _NOT_COMPARABLE
+            ),
         ),
         context=context,
     )
@@ -168,14 +191,16 @@ def _beside(
 
 
 def _row(label: str, metric: Metric, paper: float, found: Change, scenes: int) -> tuple[str, ...]:
+    comparable = metric.name not in _NOT_COMPARABLE
     return (
         label,
         metric.label,
-        percent(paper, metric),
-        f"{percent(found.change, metric)}{lacking(found, scenes)}",
-        interval(found),
-        agreement(found),
-        _verdict(found, paper),
+        pointed(paper, metric),
+        f"{pointed(found.change, metric)}{lacking(found, scenes)}",
+        interval(found.low, found.high),
+        f"{found.change / paper:.2f}" if comparable and not math.isnan(found.change) else "",
+        same_sign(found),
+        _verdict(found, paper) if comparable else "not comparable",
     )
 
 
@@ -258,7 +283,7 @@ def texture_tables(
         contexts: How the cells of each condition were trained and scored.
 
     Returns:
-        Tables with a row for each ablation and score: the change in percent of each scene, from the
+        Tables with a row for each ablation and score: the change of each scene, from the
         least textured scene to the most textured one, and Spearman's rank correlation of texture
         and change.
     """
@@ -279,18 +304,18 @@ def _by_texture(
     """Return the table of a condition; `scenes` has its textures by scene, in rising order."""
     per_scene = by_key(comparison.per_scene)
     rows: list[tuple[str, ...]] = []
-    metrics = [metric for metric in comparison.metrics if not is_amount(metric)]
+    metrics = [metric for metric in comparison.metrics if metric.score is not None]
     for label in [name for name, of in comparison.groups if of == condition]:
         for metric in metrics:
             found = [per_scene.get((label, condition, name, metric.name)) for name in scenes.index]
             values = [math.nan if row is None else row.change for row in found]
             changes = pd.Series(values, scenes.index)
             if changes.notna().any():
-                texts = (percent(change, metric) for change in changes)
-                rows.append((label, metric.label, *texts, _rank_correlation(scenes, changes)))
+                texts = (pointed(change, metric) for change in changes)
+                rows.append((label, named(metric), *texts, _rank_correlation(scenes, changes)))
     heads = tuple(f"{scene} ({value:.4f})" for scene, value in scenes.items())
     return TextTable(
-        title=titled(f"Change from {comparison.base} by the texture of the scene, %", condition),
+        title=titled(f"Change from {comparison.base} by the texture of the scene", condition),
         columns=("Ablation", "Metric", *heads, "rank correlation"),
         rows=tuple(rows),
         align="ll" + "r" * (len(scenes) + 1),
@@ -299,7 +324,6 @@ def _by_texture(
             " intensity per px; the least textured scene first",
             "rank correlation: Spearman's, of texture and change over the scenes; it describes"
             " these scenes, and so few are no test",
-            ARROWS_NOTE,
         ),
         context=context_of(contexts, condition).of_scores,
     )

@@ -16,7 +16,7 @@ from xrgs.capture.images import ImageError
 from xrgs.errors import StoreError, UnreadableError
 from xrgs.experiment.trimming import check_images
 from xrgs.report.collect import ReportError
-from xrgs.report.compare import is_amount
+from xrgs.report.compare import is_ratio
 from xrgs.report.curves import means_over_runs, means_over_scenes
 from xrgs.report.figures import (
     MAX_ARMS,
@@ -195,7 +195,7 @@ def sensitivities(comparison: Comparison, condition: str) -> dict[str, pd.DataFr
         condition: The condition that the cells were run under.
 
     Returns:
-        By the setting's key, for each that has at least three values: one row for each change in %,
+        By the setting's key, for each that has at least three values: one row for each change,
         with `level` (`pair`, `scene` or `mean`), `scene` (missing for a mean), `metric`, `change`,
         `value` (of the setting) and `series` (the rest of the label: each is a curve).
     """
@@ -210,14 +210,12 @@ def sensitivities(comparison: Comparison, condition: str) -> dict[str, pd.DataFr
 
 
 def _changes(comparison: Comparison, condition: str) -> pd.DataFrame:
-    """Return the changes of pairs, of scenes and of the means in percent, in one table."""
+    """Return the changes of pairs, of scenes and of the means in one table, as tables show them."""
     pairs = comparison.pairs
-    amounts = {metric.name for metric in comparison.metrics if is_amount(metric)}
-    percent = np.where(
-        pairs["metric"].isin(amounts), 100 * np.expm1(pairs["effect"]), pairs["effect"]
-    )
+    ratios = {metric.name for metric in comparison.metrics if is_ratio(metric)}
+    shown = np.where(pairs["metric"].isin(ratios), 100 * np.expm1(pairs["effect"]), pairs["effect"])
     levels = {
-        "pair": pairs.assign(change=percent),
+        "pair": pairs.assign(change=shown),
         "scene": comparison.per_scene.reset_index(),
         "mean": comparison.means.reset_index().assign(scene=None),
     }

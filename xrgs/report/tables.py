@@ -9,33 +9,26 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from xrgs.report.compare import is_amount
+from xrgs.report.compare import is_ratio
 from xrgs.report.context import context_of
 from xrgs.report.inference import ALL_HR
 from xrgs.report.markup import filled, titled
 from xrgs.report.writing import (
-    ARROWS_NOTE,
-    LACKING_NOTE,
     MISSING,
     NO_INTERVAL,
     SAME,
     Change,
-    agreement,
-    agreement_note,
     by_key,
-    false_discovery,
-    false_discovery_note,
     interval,
-    interval_note,
     lacking,
     marked,
+    named,
     number,
-    percent,
-    reading,
-    scale_note,
-    scatter,
-    scatter_note,
+    p_value,
+    pointed,
+    same_sign,
     signed,
+    verdict,
 )
 from xrgs.runtime.text import TextTable
 
@@ -121,22 +114,22 @@ class Tables:
 
     def _overview(self, labels: list[str], condition: str) -> TextTable:
         base, scenes = self.comparison.base, len(self.comparison.scenes)
-        same = {name for name in labels if self.unchanged(name, condition)}
+        outcomes = [m for m in self.comparison.metrics if m.name in self.comparison.design.outcomes]
+        same = {name: why for name in labels if (why := self.unchanged(name, condition))}
         rows = tuple(
-            (metric.label, *(SAME if name in same else
-                             marked(self._means.get((name, condition, metric.name)), metric, scenes)
-                             for name in labels))
-            for metric in self.comparison.metrics
+            (name, *(SAME if name in same else
+                     marked(self._means.get((name, condition, metric.name)), metric, scenes)
+                     for metric in outcomes))
+            for name in labels
         )  # fmt: skip
-        without_effect = tuple(f"{name} {self.unchanged(name, condition)}" for name in sorted(same))
         return TextTable(
-            title=titled(f"Change from {base}, %, mean over scenes", condition),
-            columns=("Metric", *(f"{name} vs {base}" for name in labels)),
+            title=titled(f"Change from {base}, mean over scenes", condition),
+            columns=("Ablation", *map(named, outcomes)),
             rows=rows,
-            align="l" + "r" * len(labels),
+            align="l" + "r" * len(outcomes),
             notes=(
-                *(*self._context(condition).cautions, ARROWS_NOTE, *without_effect),
-                *self._mean_notes(labels, condition),
+                *self._context(condition).cautions,
+                *(f"{name} {why}" for name, why in same.items()),
             ),
             context=self._context(condition).of_all,
             name=f"overview {condition}".strip(),
@@ -161,19 +154,8 @@ class Tables:
             return ""
         return f"changes nothing: its scores, counts and amounts of work are those of {base}"
 
-    def _mean_notes(self, labels: list[str], condition: str) -> tuple[str, ...]:
-        """Say how means of these labels were made, and what their marks are."""
-        keys = ((name, condition, m.name) for name in labels for m in self.comparison.metrics)
-        found = [self._means[key] for key in keys if key in self._means]
-        lacks = any(lacking(row, len(self.comparison.scenes)) for row in found)
-        return (
-            scale_note(self.comparison),
-            *false_discovery_note(self.comparison, condition),
-            *[LACKING_NOTE] * lacks,
-        )
-
     def mean(self, label: str, condition: str) -> TextTable:
-        """Return the paper's Table 1 for one ablation, with values, intervals and readings."""
+        """Return the changes of one ablation, with values, intervals and verdicts."""
         base, scenes = self.comparison.base, len(self.scenes_of(label, condition))
         keys = ((label, condition, metric.name) for metric in self.comparison.metrics)
         found = [
@@ -186,36 +168,28 @@ class Tables:
             return TextTable(title, ("Result",), ((f"{label} {why}",),), "l")
         # What holds of every row is said once.
         alone = NO_INTERVAL if all(math.isnan(row.low) for row, _ in found) else ""
+        corrected = "p (Holm)" if label in self.comparison.design.headline else "q"
         table = TextTable(
             title=title,
             columns=(
-                *("Metric", base, label, f"change from {base}, %", "dB", "95 % interval, %"),
-                *("pairs that agree", "sd replicates, %", "sd scenes, %", "q", "reading"),
+                *("Metric", base, label, "change", "95 % interval", "new scene"),
+                *("same sign (p)", corrected, "verdict"),
             ),
             rows=tuple(_mean_row(row, metric, scenes, alone) for row, metric in found),
-            align="lrrrrrrrrrl",
-            notes=self._change_notes(found, label, condition) if found else (),
+            align="lrrrrrrrl",
+            notes=(
+                *(*self._context(condition).cautions, *self._notes.get((label, condition), ())),
+                *(
+                    f"{metric.label}: pairs left out ({row.why})"
+                    for row, metric in found
+                    if row.why and not math.isnan(row.change)
+                ),
+                *self._mixed_note(label, condition),
+            ),
             context="; ".join(filter(None, (alone, self._context(condition).of_all))),
             name=f"{label} {condition}".strip(),
         )
         return filled(table)
-
-    def _change_notes(
-        self, found: Sequence[tuple[Change, Metric]], label: str, condition: str
-    ) -> tuple[str, ...]:
-        """Say what the columns of an ablation's table mean, and what its means leave out."""
-        changes = [row for row, _ in found]
-        left_out = (
-            f"{metric.label}: pairs left out ({row.why})"
-            for row, metric in found
-            if row.why and not math.isnan(row.change)
-        )
-        return (
-            *(*self._context(condition).cautions, *self._notes.get((label, condition), ())),
-            *(ARROWS_NOTE, *agreement_note(changes), *left_out),
-            *(*self._interval_note(label, condition), *scatter_note(changes)),
-            *self._mean_notes([label], condition),
-        )
 
     def _extent(self, label: str, condition: str) -> str:
         """Say how many scenes and which replicates a mean is over."""
@@ -227,12 +201,13 @@ class Tables:
         names = f"{len(scenes)}{of} scenes" if len(scenes) != 1 or of else f"scene {scenes[0]}"
         return f"{names}, {_listed(replicates)}"
 
-    def _interval_note(self, label: str, condition: str) -> tuple[str, ...]:
-        """Say what the intervals of a table are over; nothing where there are none."""
-        found = (self._means.get((label, condition, m.name)) for m in self.comparison.metrics)
+    def _mixed_note(self, label: str, condition: str) -> tuple[str, ...]:
+        """Say that intervals mix two kinds of scatter, where several scenes have one replicate."""
         scenes = self.scenes_of(label, condition)
         counts = {len(self._replicates[label, condition, s]) for s in scenes}
-        return interval_note(filter(None, found), one_each=counts == {1})
+        if counts != {1} or len(scenes) < 2:
+            return ()
+        return ("one replicate a scene: differences of runs and of scenes are mixed",)
 
     def per_scene(self, label: str, condition: str) -> TextTable:
         """Return a table with one column for each scene, failed ones too, and their mean."""
@@ -242,24 +217,16 @@ class Tables:
             found = [self._per_scene.get((label, condition, s, metric.name)) for s in scenes]
             mean = self._means.get((label, condition, metric.name))
             cells = [
-                *(MISSING if row is None else percent(row.change, metric) for row in found),
+                *(MISSING if row is None else pointed(row.change, metric) for row in found),
                 marked(mean, metric, len(scenes)),
             ]
-            rows.append((f"{metric.label}, %", *cells))
-            if metric.unit == "dB":
-                absolute = [
-                    MISSING if row is None else signed(row.difference) for row in (*found, mean)
-                ]
-                rows.append((f"{metric.label}, dB", *absolute))
+            rows.append((named(metric), *cells))
         return TextTable(
             title=titled(f"{label}: change from {self.comparison.base}, scene by scene", condition),
             columns=("Metric", *scenes, "mean"),
             rows=tuple(rows),
             align="l" + "r" * (len(scenes) + 1),
-            notes=(
-                *(*self._context(condition).cautions, ARROWS_NOTE),
-                *self._mean_notes([label], condition),
-            ),
+            notes=self._context(condition).cautions,
             context=self._context(condition).of_all,
             name=f"scenes {label} {condition}".strip(),
         )
@@ -332,15 +299,15 @@ class Tables:
 
     def _scores(self) -> list[Metric]:
         """Return the scores of views, in the order of papers."""
-        known = [metric for metric in self.comparison.metrics if not is_amount(metric)]
+        known = [metric for metric in self.comparison.metrics if metric.score is not None]
         return sorted(known, key=lambda metric: _PAPER_ORDER.get(metric.name, len(_PAPER_ORDER)))
 
     def gaps(self) -> list[TextTable]:
         """Return a table for each condition that has all_hr and another ablation.
 
         It has a row for each ablation and score: the share of the gap in percent, scene by scene
-        and in the mean over scenes, with Student's interval and how many pairs agree. Notes say why
-        a scene has no share, or a mean leaves out some of its pairs.
+        and in the mean over scenes, with its interval and sign test. Notes say why a scene has no
+        share, or a mean leaves out some of its pairs.
         """
         means, per_scene = by_key(self.comparison.gaps), by_key(self.comparison.gaps_per_scene)
         conditions = dict.fromkeys(condition for _, condition, _ in means)
@@ -364,18 +331,16 @@ class Tables:
                 found = [per_scene.get((label, condition, s, metric.name)) for s in scenes]
                 shares = [MISSING if row is None else signed(row.change) for row in found]
                 shares.append(f"{signed(mean.change)}{lacking(mean, len(scenes))}")
-                rows.append((label, metric.label, *shares, interval(mean), agreement(mean)))
+                bounds = interval(mean.low, mean.high)
+                rows.append((label, metric.label, *shares, bounds, same_sign(mean)))
                 for scene, row in zip(scenes, found, strict=True):
                     if row is not None and row.why:
                         what = "n/a" if math.isnan(row.change) else "pairs left out"
                         note = f"{metric.label}, {scene}: {what} ({row.why})"
                         left_out.setdefault(note, []).append(label)
-        here = [row for key, row in means.items() if key[1] == condition]
-        pairs = comparison.pairs[comparison.pairs["condition"] == condition]
-        one_each = set(pairs.groupby(["label", "scene"])["cell_id"].nunique()) == {1}
         table = TextTable(
             title=titled(f"Share of the gap from {base} to {ALL_HR} that is closed, %", condition),
-            columns=("Ablation", "Metric", *scenes, "mean", "95 % interval, %", "pairs that agree"),
+            columns=("Ablation", "Metric", *scenes, "mean", "95 % interval", "same sign (p)"),
             rows=tuple(rows),
             align="ll" + "r" * (len(scenes) + 3),
             notes=(
@@ -386,9 +351,6 @@ class Tables:
                     note if len(of) == len(labels) else f"{note}: {', '.join(of)}"
                     for note, of in left_out.items()
                 ),
-                *agreement_note(here),
-                *interval_note(here, one_each=one_each),
-                *[LACKING_NOTE] * any(lacking(row, len(scenes)) for row in here),
             ),
             context=self._context(condition).of_scores,
         )
@@ -419,21 +381,25 @@ class Tables:
         metrics = {metric.name: metric for metric in self.comparison.metrics}
         scenes = self.comparison.per_scene.reset_index()
         means = self.comparison.means.reset_index()
-        table = pd.concat([means.assign(level="mean", scene=""), scenes.assign(level="scene")])
+        scenes = scenes.assign(level="scene", outcome=False)  # verdicts are of means
+        table = pd.concat([means.assign(level="mean", scene=""), scenes])
         table = table.merge(self._long_gaps(), how="left", on=_LEVEL)
-        rows = [Change(*row) for row in table[list(Change._fields)].itertuples(index=False)]
+        rows = [*by_key(table).values()]
         of = [metrics[name] for name in table["metric"]]
-        table["printed"] = [percent(r.change, m).rstrip() for r, m in zip(rows, of, strict=True)]
-        table["reading"] = [reading(r, m) for r, m in zip(rows, of, strict=True)]
+        table["printed"] = [pointed(r.change, m).rstrip() for r, m in zip(rows, of, strict=True)]
+        table["verdict"] = [verdict(r, m) for r, m in zip(rows, of, strict=True)]
+        table["agree"] = [row.agree for row in rows]
         table["metric_unit"] = [m.unit for m in of]
+        table["change_unit"] = ["%" if is_ratio(m) else m.unit for m in of]
         table["against"] = self.comparison.base
         table["higher_is_better"] = [m.higher_is_better for m in of]
-        table = table.rename(columns={"n": "n_values", "unit": "n_of", "change": "change_percent"})
+        table = table.rename(columns={"n": "n_values", "unit": "n_of", "holm": "p_holm"})
         return table[
-            [*_LEVEL, "metric_unit", "higher_is_better",
-             "against", "base", "value", "change_percent", "difference", "low", "high",
-             "n_values", "n_of", "scenes", "agree", "pairs", "scatter_replicates", "scatter_scenes",
-             "p", "q", "printed", "reading", "why", *_GAP.values()]
+            [*_LEVEL, "metric_unit", "higher_is_better", "outcome", "against", "base", "value",
+             "change", "change_unit", "low", "high", "new_low", "new_high",
+             "n_values", "n_of", "scenes", "pairs", "agree", "p_sign",
+             "scatter_replicates", "scatter_scenes", "p", "q", "p_holm", "p_equivalent",
+             "printed", "verdict", "why", *_GAP.values()]
         ]  # fmt: skip
 
     def _long_gaps(self) -> pd.DataFrame:
@@ -468,20 +434,18 @@ def _mean_row(row: Change, metric: Metric, scenes: int, said: str) -> tuple[str,
         row: The change.
         metric: The metric that changed.
         scenes: How many scenes the mean should be over.
-        said: A reading that the table's context has, and that no row repeats.
+        said: A verdict that the table's context has, and that no row repeats.
     """
-    read = reading(row, metric)
+    read = verdict(row, metric)
     return (
-        metric.label,
+        named(metric),
         number(row.base, metric.unit),
         number(row.value, metric.unit),
-        f"{percent(row.change, metric)}{lacking(row, scenes)}",
-        signed(row.difference) if metric.unit == "dB" else "",
-        interval(row),
-        agreement(row),
-        scatter(row.scatter_replicates),
-        scatter(row.scatter_scenes),
-        false_discovery(row),
+        f"{pointed(row.change, metric)}{lacking(row, scenes)}",
+        interval(row.low, row.high),
+        interval(row.new_low, row.new_high),
+        same_sign(row),
+        p_value(row.p_corrected),
         "" if read == said else read,
     )
 

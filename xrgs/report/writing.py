@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, NamedTuple
 
-from xrgs.report.compare import is_amount
-from xrgs.report.inference import FALSE_DISCOVERIES, MIN_VALUES
+from xrgs.report.compare import is_ratio
+from xrgs.report.inference import LEVEL, MIN_VALUES
+from xrgs.runtime.text import TextTable
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     import pandas as pd
 
     from xrgs.evaluation.metrics import Metric
@@ -20,13 +19,12 @@ if TYPE_CHECKING:
 BETTER, WORSE, SAME = "↑", "↓", "="
 #: The text of a number whose cells all failed, or were not trained yet.
 MISSING = "missing"
-#: The reading of a change without an interval.
+#: The verdict of a change without an interval.
 NO_INTERVAL = "one replicate: no interval"
-ARROWS_NOTE = f"{BETTER} improvement, {WORSE} degradation, {SAME} no change at this precision"
-LACKING_NOTE = "(k of n): a mean over k of the n scenes"
-_MARK = "*"
-#: Counts from this on are written in units of 10^6 or 10^9, as 17.9 G.
-_LARGE = 1e7
+#: What stands for a verdict beside a change.
+_MARKS = {"better": " *", "worse": " *", "equivalent": " ≈"}
+#: Counts from this on are written in one of these units, as 17.9 G.
+_LARGE, _PREFIXES = 1e7, ((1e12, "T"), (1e9, "G"), (1e6, "M"))
 
 
 class Change(NamedTuple):
@@ -35,33 +33,51 @@ class Change(NamedTuple):
     base: float
     value: float
     change: float
-    difference: float
     low: float
     high: float
+    new_low: float
+    new_high: float
     n: int
     unit: str
     scenes: int
+    pairs: int
+    up: int
+    down: int
     scatter_replicates: float
     scatter_scenes: float
     p: float
-    q: float
+    p_sign: float
     why: str
-    agree: int
-    pairs: int
+    outcome: bool = False
+    q: float = math.nan
+    holm: float = math.nan
+    p_equivalent: float = math.nan
+
+    @property
+    def agree(self) -> int:
+        """How many of the n values have the sign of their mean."""
+        if self.change > 0:
+            return self.up
+        return self.down if self.change < 0 else self.n - self.up - self.down
+
+    @property
+    def p_corrected(self) -> float:
+        """Holm's p of a headline label, else q."""
+        return self.q if math.isnan(self.holm) else self.holm
 
 
 def number(value: float, unit: str) -> str:
     """Write a value with its unit, at a precision that fits its size; NaN as n/a.
 
-    Bytes are written in MiB, and counts from ten million on with three digits in units of 10^6 or
-    10^9: `17.9 G`.
+    Bytes are written in MiB, and counts from ten million on with three digits in units of 10^6,
+    10^9 or 10^12: `17.9 G`.
     """
     if math.isnan(value):
         return "n/a"
     if unit == "bytes":
         return f"{value / 2**20:,.1f} MiB"
     if not unit and _LARGE <= abs(value) < math.inf:
-        scale, prefix = (1e9, "G") if abs(value) >= 999.5e6 else (1e6, "M")
+        scale, prefix = next(of for of in _PREFIXES if abs(value) >= 0.9995 * of[0])
         return f"{value / scale:#.3g} {prefix}".replace(". ", " ")
     if math.isinf(value) or abs(value) >= (10 if unit == "s" else 1000):
         text = f"{value:,.0f}"
@@ -81,7 +97,7 @@ def signed(value: float) -> str:
 
 
 def arrow(change: float, metric: Metric) -> str:
-    """Return whether a change in percent is an improvement, in the metric's own direction.
+    """Return whether a change is an improvement, in the metric's own direction.
 
     Returns:
         `BETTER`, `WORSE`, `SAME` where the change is printed as 0.00, or a space for NaN.
@@ -93,30 +109,35 @@ def arrow(change: float, metric: Metric) -> str:
     return BETTER if (change > 0) == metric.higher_is_better else WORSE
 
 
-def percent(change: float, metric: Metric) -> str:
-    """Write a change in percent as the paper's tables do: `-44.57 ↑`."""
+def named(metric: Metric) -> str:
+    """Return the name of a metric with the unit of its changes: `PSNR, dB` or `LPIPS, %`."""
+    return f"{metric.label}, {'%' if is_ratio(metric) else metric.unit}"
+
+
+def pointed(change: float, metric: Metric) -> str:
+    """Write a change with its arrow as the paper's tables do: `-44.57 ↑`."""
     return f"{signed(change)} {arrow(change, metric)}"
 
 
-def reading(row: Change, metric: Metric) -> str:
-    """Say in words what the interval of a change shows.
+def verdict(row: Change, metric: Metric) -> str:
+    """Say in words what the tests of a change show.
 
     Returns:
-        `better` or `worse` where the interval does not hold 0, `interval holds 0` where it does, or
-        `unchanged`; `two values: no verdict`, `one replicate: no interval`, or `n/a` with the
-        reason.
+        `equivalent` where the change is within its margin (TOST), else `better` or `worse` where
+        the corrected p is at most 0.05, else `not shown`; `descriptive` for a metric that is no
+        outcome; `one replicate: no interval`, or `n/a` with the reason.
     """
     if math.isnan(row.change):
         return f"n/a: {row.why}"
     if math.isnan(row.low):
         return NO_INTERVAL
-    if row.n < MIN_VALUES:
-        return "two values: no verdict"
-    if row.low <= 0 <= row.high and row.low < row.high:
-        return "interval holds 0"
-    if arrow(row.change, metric) == SAME:
-        return "unchanged"
-    return "better" if (row.change > 0) == metric.higher_is_better else "worse"
+    if not row.outcome:
+        return "descriptive"
+    if row.p_equivalent <= LEVEL:
+        return "equivalent"
+    if row.p_corrected <= LEVEL:
+        return "better" if (row.change > 0) == metric.higher_is_better else "worse"
+    return "not shown"
 
 
 def marked(row: Change | None, metric: Metric, scenes: int) -> str:
@@ -128,12 +149,13 @@ def marked(row: Change | None, metric: Metric, scenes: int) -> str:
         scenes: How many scenes the mean should be over.
 
     Returns:
-        The change, a star where q is at most 0.05, and the number of scenes behind the mean where
-        some are lacking.
+        The change, a star where it is shown to be better or worse, `≈` where it is equivalent, and
+        the number of scenes behind the mean where some are lacking.
     """
     if row is None:
         return MISSING
-    return f"{percent(row.change, metric)}{_star(row)}{lacking(row, scenes)}"
+    mark = _MARKS.get(verdict(row, metric), "")
+    return f"{pointed(row.change, metric)}{mark}{lacking(row, scenes)}"
 
 
 def lacking(row: Change, scenes: int) -> str:
@@ -141,89 +163,62 @@ def lacking(row: Change, scenes: int) -> str:
     return f" ({row.scenes} of {scenes})" if 0 < row.scenes < scenes else ""
 
 
-def false_discovery(row: Change) -> str:
-    """Write q of a change, `0.034 *`, with a star where it is at most 0.05; empty for NaN."""
-    if math.isnan(row.q):
+def p_value(p: float) -> str:
+    """Write a p or q with three decimals; empty for NaN."""
+    if math.isnan(p):
         return ""
-    return f"{'<0.001' if row.q < 0.001 else f'{row.q:.3f}'}{_star(row)}"
+    return "<0.001" if p < 0.001 else f"{p:.3f}"
 
 
-def _star(row: Change) -> str:
-    return f" {_MARK}" if row.q <= FALSE_DISCOVERIES else ""
+def interval(low: float, high: float) -> str:
+    """Write an interval, `-1.20 to +3.40`; empty where there is none."""
+    return "" if math.isnan(low) else f"{signed(low)} to {signed(high)}"
 
 
-def scatter(deviation: float) -> str:
-    """Write a standard deviation in percent; empty for NaN."""
-    return "" if math.isnan(deviation) else f"{deviation:,.2f}"
+def same_sign(row: Change) -> str:
+    """Write how many values have the sign of their mean, and the p of the sign test.
 
-
-def interval(row: Change) -> str:
-    """Write the 95 % interval of a change in percent; empty where there is none."""
-    return "" if math.isnan(row.low) else f"{signed(row.low)} to {signed(row.high)}"
-
-
-def agreement(row: Change) -> str:
-    """Write how many of several pairs changed in the direction of their mean, `11 of 12`."""
-    return f"{row.agree} of {row.pairs}" if row.pairs > 1 else ""
-
-
-def agreement_note(rows: Iterable[Change]) -> tuple[str, ...]:
-    """Explain the column of pairs that agree; nothing where no row has several pairs."""
-    if not any(map(agreement, rows)):
-        return ()
-    return ("pairs that agree: pairs of one scene and replicate that change as their mean does",)
-
-
-def scatter_note(rows: Iterable[Change]) -> tuple[str, ...]:
-    """Say what the standard deviations of a table are over; nothing where there are none."""
-    if not any(scatter(row.scatter_replicates) or scatter(row.scatter_scenes) for row in rows):
-        return ()
-    return (
-        "sd replicates: standard deviation of the replicates, pooled within scenes; sd scenes:"
-        " standard deviation of the scenes' means",
-    )
-
-
-def interval_note(rows: Iterable[Change], *, one_each: bool) -> tuple[str, ...]:
-    """Say what the intervals of a table are over; nothing where there are none.
-
-    Args:
-        rows: The changes in the table.
-        one_each: Whether each scene has one replicate.
+    Returns:
+        `4 of 4 (0.125)`; empty for fewer than two values.
     """
-    units = {row.unit for row in rows if not math.isnan(row.low)}
-    if not units:
-        return ()
-    if "scenes" not in units:
-        return ("interval: Student's t over the replicates",)
-    alone = "; with one replicate, differences of runs and of scenes are mixed" * one_each
-    return (f"interval: Student's t over the scenes' means{alone}",)
+    return f"{row.agree} of {row.n} ({p_value(row.p_sign)})" if row.n > 1 else ""
 
 
-def scale_note(comparison: Comparison) -> str:
-    """Say which metrics are compared by ratio and which by percentage."""
-    amounts = ", ".join(metric.label for metric in comparison.metrics if is_amount(metric))
-    scores = ", ".join(metric.label for metric in comparison.metrics if not is_amount(metric))
-    return (
-        f"means, intervals and sd: of log(value / {comparison.base}), turned into %, for {amounts};"
-        f" of the change in % for {scores}"
-    )
-
-
-def false_discovery_note(comparison: Comparison, condition: str) -> tuple[str, ...]:
-    """Say what q is and which tests of a condition it is over; nothing where there are none."""
-    of = comparison.means.index.get_level_values("condition") == condition
-    tests = comparison.means.loc[of, "p"].count()
-    if not tests:
-        return ()
-    return (
-        f"q: Benjamini and Hochberg's rate of false discoveries over {tests} t-tests, of all"
-        f" ablations and metrics with at least {MIN_VALUES} values; {_MARK} where it is at most"
-        f" {FALSE_DISCOVERIES:g}",
-    )
+def legend(comparison: Comparison) -> TextTable:
+    """Return the table that says what the columns and marks of the tables of changes mean."""
+    design, base = comparison.design, comparison.base
+    outcomes = ", ".join(m.label for m in comparison.metrics if m.name in design.outcomes)
+    with_p = f"at least {MIN_VALUES} values"
+    rows = (
+        ("change", f"mean over scenes of the means over replicates: the difference from {base} in"
+                   f" dB, or the mean log(value / {base}) in percent"),
+        (f"{BETTER} {WORSE} {SAME}", "improvement, degradation, no change at this precision"),
+        ("(3 of 4)", "beside a mean: it is over 3 of the 4 scenes"),
+        ("95 % interval", "Student's t over the scenes' means; of one scene, over its replicates"),
+        ("new scene", "95 % prediction interval of one more scene like these: of the mean over its"
+                      " replicates"),
+        ("same sign (p)", "scenes that change as their mean does, and the p of the exact sign"
+                          " test; of one scene, replicates"),
+        ("q", "Benjamini and Hochberg's rate of false discoveries, from the t-tests of the"
+              f" outcomes of all ablations of a condition, of {with_p}; amounts are corrected apart"
+              " from scores"),
+        *((("p (Holm)", f"the p of {', '.join(design.headline)}, corrected by Holm instead of q"),)
+          if design.headline else ()),
+        ("better, worse *", f"q, or the p of Holm, is at most {LEVEL:g}"),
+        ("equivalent ≈", f"the change is within {design.margin_psnr:g} dB of PSNR or"
+                         f" {design.margin_lpips:g} % of LPIPS: p of two one-sided t-tests (TOST)"
+                         f" is at most {LEVEL:g}"),
+        ("not shown", "neither of them"),
+        ("descriptive", f"without a verdict: the outcomes of this report are {outcomes}"),
+    )  # fmt: skip
+    return TextTable("How to read the tables", ("", "meaning"), rows, "ll")
 
 
 def by_key(table: pd.DataFrame) -> dict[tuple[str, ...], Change]:
     """Return the rows of one of a `Comparison`'s tables of means, by their keys."""
-    rows = table[list(Change._fields)].itertuples(index=False)
-    return {key: Change(*row) for key, row in zip(table.index, rows, strict=True)}
+    columns = [name for name in Change._fields if name in table]
+    rows = table[columns].itertuples(index=False)
+    return {
+        key: Change(**dict(zip(columns, row, strict=True)))
+        for key, row in zip(table.index, rows, strict=True)
+    }

@@ -2,8 +2,8 @@
 
 To add a score of views, add a file with its function, and an entry to `METRICS`; `xrgs-store
 rescore` then computes it for cells that are done. Any other entry is a figure of the cell's
-summary. torch and kornia are imported where they are used, because plans and reports are made
-without them.
+summary, or follows from the PSNR of its views (`xrgs.experiment.results.over_views`). torch and
+kornia are imported where they are used, because plans and reports are made without them.
 """
 
 from __future__ import annotations
@@ -50,6 +50,8 @@ METRICS = (
     Metric("lpips", "LPIPS", "", higher_is_better=False, score=lpips, sources=_LPIPS),
     Metric("ssim", "SSIM", "", higher_is_better=True, score=ssim, sources=_SSIM),
     Metric("psnr", "PSNR", "dB", higher_is_better=True, score=psnr, sources=_PSNR),
+    Metric("psnr_pooled", "PSNR, views pooled", "dB", higher_is_better=True),
+    Metric("psnr_worst", "PSNR, worst view", "dB", higher_is_better=True),
     Metric(
         "psnr_plain",
         "PSNR without masks",

@@ -11,8 +11,9 @@ import pandas as pd
 from xrgs.errors import StoreError
 from xrgs.evaluation.metrics import VIEW_METRICS
 from xrgs.report.collect import CURVE_COLUMNS, number_columns
+from xrgs.report.compare import is_ratio
 from xrgs.report.markup import titled
-from xrgs.report.writing import arrow, by_key, reading, signed
+from xrgs.report.writing import arrow, by_key, signed, verdict
 from xrgs.safeio.sanitize import MAX_CELL, counted, for_line
 
 if TYPE_CHECKING:
@@ -179,10 +180,10 @@ class Answer:
     pairs: str
     """The numbers of scenes and pairs behind it, as a phrase."""
     better: tuple[str, ...]
-    """The metrics that the intervals show to be better, with their change."""
+    """The outcomes that the tests show to be better, with their change."""
     worse: tuple[str, ...]
     undecided: tuple[tuple[str, tuple[str, ...]], ...]
-    """Readings that are no verdict, each with its metrics and their changes."""
+    """Other verdicts, each with its metrics and their changes."""
 
 
 def answers(comparison: Comparison) -> list[Answer]:
@@ -195,10 +196,10 @@ def answers(comparison: Comparison) -> list[Answer]:
             for metric in comparison.metrics
             if (label, condition, metric.name) in means
         ]
-        readings: dict[str, list[str]] = {}
+        verdicts: dict[str, list[str]] = {}
         for metric, row in rows:
-            readings.setdefault(shown(reading(row, metric)), []).append(_change(metric, row))
-        better, worse = (tuple(readings.pop(verdict, ())) for verdict in ("better", "worse"))
+            verdicts.setdefault(shown(verdict(row, metric)), []).append(_change(metric, row))
+        better, worse = (tuple(verdicts.pop(verdict, ())) for verdict in ("better", "worse"))
         scenes = max((row.scenes for _, row in rows), default=0)
         pairs = max((row.pairs for _, row in rows), default=0)
         found.append(
@@ -208,7 +209,7 @@ def answers(comparison: Comparison) -> list[Answer]:
                 pairs=f"{counted(scenes, 'scene')}, {counted(pairs, 'pair')} of cells",
                 better=better,
                 worse=worse,
-                undecided=tuple((why, tuple(texts)) for why, texts in readings.items()),
+                undecided=tuple((why, tuple(texts)) for why, texts in verdicts.items()),
             )
         )
     return found
@@ -217,8 +218,8 @@ def answers(comparison: Comparison) -> list[Answer]:
 def _change(metric: Metric, row: Change) -> str:
     if math.isnan(row.change):
         return metric.label
-    absolute = f" ({signed(row.difference)} dB)" if metric.unit == "dB" else ""
-    return f"{metric.label} {signed(row.change)} % {arrow(row.change, metric)}{absolute}"
+    unit = "%" if is_ratio(metric) else metric.unit
+    return f"{metric.label} {signed(row.change)} {unit} {arrow(row.change, metric)}"
 
 
 def page_context(

@@ -32,7 +32,7 @@ from xrgs.report.html.images import ERROR_RANGE, add_trained, add_views
 from xrgs.report.markup import filled, filled_places, titled, to_latex, to_markdown
 from xrgs.report.paper import counterparts
 from xrgs.report.photographs import photographs
-from xrgs.report.writing import NO_INTERVAL, number, signed
+from xrgs.report.writing import NO_INTERVAL, named, number, signed
 from xrgs.runtime.text import TextTable
 from xrgs.safeio.atomic import write_text
 from xrgs.safeio.sanitize import for_csv, for_line
@@ -235,8 +235,8 @@ def _lines(table: TextTable) -> dict[str, dict[str, list[str]]]:
 #: The columns of the table of all changes, and their alignment; `{base}` stands for the base's
 #: label.
 _CHANGE_COLUMNS = {
-    "Ablation": "l", "Scene": "l", "Metric": "l", "Change, %": "r", "Reading": "l", "{base}": "r",
-    "Value": "r", "From, %": "r", "To, %": "r", "q": "r", "Pairs that agree": "l",
+    "Ablation": "l", "Scene": "l", "Metric": "l", "Change": "r", "Verdict": "l", "{base}": "r",
+    "Value": "r", "From": "r", "To": "r", "q": "r", "Same sign": "l",
 }  # fmt: skip
 
 
@@ -265,8 +265,8 @@ def _changes(long: pd.DataFrame, scenes: Sequence[str]) -> Iterator[dict[str, An
             continue
         metric, printed = metrics[row["metric"]], str(row["printed"]).strip()
         label, scene = shown(row["label"]), shown(row["scene"] or only)
-        verdict = {"↑": "better", "↓": "worse"}.get(printed[-1:], "")
-        read = "" if row["reading"] == NO_INTERVAL else shown(row["reading"])
+        direction = {"↑": "better", "↓": "worse"}.get(printed[-1:], "")
+        verdict = "" if row["verdict"] == NO_INTERVAL else shown(row["verdict"])
         numbers = [
             (text, finite(row[name]), "")
             for name, text in (
@@ -284,11 +284,11 @@ def _changes(long: pd.DataFrame, scenes: Sequence[str]) -> Iterator[dict[str, An
             "cells": [
                 (titled(label, shown(row["condition"])), None, ""),
                 ("" if only else scene or "mean", None, ""),
-                (metric.label, None, ""),
-                (printed, finite(row["change_percent"]), verdict),
-                (read, None, ""),
+                (named(metric), None, ""),
+                (printed, finite(row["change"]), direction),
+                (verdict, None, ""),
                 *numbers,
-                (f"{row['agree']} of {row['pairs']}" if row["pairs"] > 1 else "", None, ""),
+                (f"{row['agree']} of {row['n_values']}" if row["n_values"] > 1 else "", None, ""),
             ],
         }
 
