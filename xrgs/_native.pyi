@@ -76,6 +76,7 @@ class RenderConfig:
         background: Sequence[float],
         sh_degree: int,
         culling: Sequence[bool],
+        raw: bool = False,
     ) -> None: ...
 
 class Frame:

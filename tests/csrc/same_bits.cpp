@@ -327,10 +327,16 @@ void activations_part(int threads) {
   print("logistic", kernels.logistic, kernels.logistic_backward);
 }
 
-void raster_part(int threads, bool antialiased, bool absgrad, const char* forward_name,
+void raster_part(int threads, bool antialiased, bool absgrad, bool raw, const char* forward_name,
                  const char* backward_name) {
-  const xrgs::RenderConfig config = make_config(antialiased, absgrad);
-  const Parameters p = make_gaussians(2500, config);
+  xrgs::RenderConfig config = make_config(antialiased, absgrad);
+  Parameters p = make_gaussians(2500, config);
+  if (raw) {
+    Random raw_values(11);
+    p.scales = raw_values.array(3 * p.count(), -5.0f, -1.2f);
+    p.opacities = raw_values.array(p.count(), -4.0f, 4.0f);
+    config.raw = true;
+  }
   Parameters gradients(p.count());
   xrgs::Frame frame;
   Image image, v;
@@ -478,8 +484,9 @@ int main(int argc, char** argv) {
   if (XRGS_SELECT(simd_checks).run() != 0) return 1;
   array_math_part();
   activations_part(threads);
-  raster_part(threads, false, false, "forward", "backward");
-  raster_part(threads, true, true, "forward-antialiased", "backward-absgrad");
+  raster_part(threads, false, false, false, "forward", "backward");
+  raster_part(threads, true, true, false, "forward-antialiased", "backward-absgrad");
+  raster_part(threads, false, false, true, "forward-raw", "backward-raw");
   loss_part(threads);
   adam_part(threads);
   densify_part(threads);

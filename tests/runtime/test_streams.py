@@ -5,15 +5,17 @@ from __future__ import annotations
 import io
 import os
 import pty
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
+import pyte
 import pytest
 
-from xrgs.runtime.streams import say
+from xrgs.runtime.streams import redraw, say
 
 _SCRIPT = """
 import sys
@@ -170,3 +172,18 @@ def test_a_message_of_a_log_is_one_line_and_a_traceback_keeps_its_lines() -> Non
     assert second.endswith(" failed")
     assert traceback[0] == "Traceback (most recent call last):"
     assert traceback[-1] == "ValueError:  ]0;t "
+
+
+def test_a_text_that_is_drawn_again_replaces_the_last_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shutil, "get_terminal_size", lambda: os.terminal_size((12, 5)))
+    screen, terminal = pyte.Screen(12, 5), io.StringIO()
+    drawn = redraw("one\nwider than that\n\x1b[31mthree\nfour\nfive", 0, terminal)
+    screen_of = pyte.Stream(screen)
+    screen_of.feed(terminal.getvalue().replace("\n", "\r\n"))
+    shown = [line.rstrip() for line in screen.display]
+    assert shown == ["one", "wider than", " [31mthree", "four", ""], "cut, and no colour"
+    terminal.truncate(0)
+    terminal.seek(0)
+    redraw("six\nseven", drawn, terminal)
+    screen_of.feed(terminal.getvalue().replace("\n", "\r\n"))
+    assert [line.rstrip() for line in screen.display] == ["six", "seven", "", "", ""]

@@ -37,6 +37,15 @@ def test_bad_input_is_named(field: str, value: Any, message: str) -> None:
         Camera(**(good | {field: value}))
 
 
+def test_the_numbers_are_those_of_the_tensors() -> None:
+    camera = Camera.look_at((1.0, 2.0, 3.0), (0.0, 0.5, 0.0), width=30, height=20)
+    numbers = camera.numbers
+    assert torch.equal(torch.tensor(numbers.viewmat).view(4, 4), camera.viewmat)
+    assert torch.equal(torch.tensor(numbers.position), camera.position)
+    (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
+    assert numbers.intrinsics == [fx, fy, cx, cy]
+
+
 def test_an_image_of_one_pixel_is_accepted() -> None:
     assert Camera(torch.eye(4), torch.eye(3), width=1, height=1).width == 1
 

@@ -195,15 +195,15 @@ def test_in_a_browser_both_models_move_as_one(model: MakeModel, browser: Any) ->
     one = model()
     with live.shown([one, one], 0, 40) as address:
         browser.get(address)
-        WebDriverWait(browser, 60).until(same)
+        WebDriverWait(browser, 180).until(same)
         before = panes()
         frame = browser.find_elements("css selector", "iframe")[1]
         drag = ActionChains(browser).move_to_element_with_offset(frame, -150, 150).click_and_hold()
         drag.move_by_offset(80, -20).release().perform()
-        WebDriverWait(browser, 60).until(
+        WebDriverWait(browser, 180).until(
             lambda _: all(abs(a - b).mean() > 3 for a, b in zip(before, panes(), strict=True))
         )
-        WebDriverWait(browser, 60).until(same)
+        WebDriverWait(browser, 180).until(same)
         said = [entry["message"] for entry in browser.get_log("browser")]
         # three.js says this of the splats of any page of viser's, once for each frame
         errors = [text for text in said if "rror" in text and "computeBoundingSphere" not in text]

@@ -56,16 +56,17 @@ class TrainingStep:
         self.target = prepare_target(self.rendered.image.detach() + 0.01)
 
     def render(self) -> None:
-        """Activate the parameters and render."""
+        """Render; the native backend activates the parameters as it reads them."""
         with use_threads(self.threads):
             self.optimizer.zero_grad()
             self.offset = zero_means2d_offset(len(self.gaussians))
             self.rendered = rasterize_parameters(
-                *self.gaussians.activated(backend=self.backend),
+                *self.gaussians.raw(),
                 self.camera,
                 RasterSettings(),
                 sh_degree=self.sh_degree,
                 means2d_offset=self.offset,
+                raw=True,
                 backend=self.backend,
             )
 

@@ -68,7 +68,7 @@ def implementation(operation: Operation, backend: str) -> ModuleType:
         ValueError: `backend` is none of the three.
         XrgsError: The native backend is configured or required, and was not built.
     """
-    return importlib.import_module(f"xrgs.splat.{resolve_backend(backend)}.{operation}")
+    return _module(f"xrgs.splat.{resolve_backend(backend)}.{operation}")
 
 
 def arithmetic(backend: str) -> str:
@@ -98,6 +98,10 @@ def arithmetic(backend: str) -> str:
             " again on this machine, or use splat.backend=torch"
         ) from error
     return "fma" if native.fused_multiply_add() else "no-fma"
+
+
+#: Imports a module, and remembers it: a training step asks for several.
+_module = functools.cache(importlib.import_module)
 
 
 @functools.cache

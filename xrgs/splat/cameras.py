@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,6 +14,17 @@ from torch import Tensor
 ORTHONORMAL_TOLERANCE = 1e-3
 """Largest entry of R R^T - I for the rotation R of a viewmat. The float32 exports of SfM are at
 1e-6; a matrix with a scale is far above."""
+
+
+class CameraNumbers(NamedTuple):
+    """A camera as plain numbers, which a kernel takes without a torch operation."""
+
+    viewmat: list[float]
+    """The 16 numbers of `Camera.viewmat`, row by row."""
+    intrinsics: list[float]
+    """fx, fy, cx, cy, px."""
+    position: list[float]
+    """`Camera.position`, world units."""
 
 
 @dataclass(frozen=True)
@@ -68,10 +81,26 @@ class Camera:
         position: Tensor = -(first + second + third)  # [3]
         return position
 
+    @cached_property
+    def numbers(self) -> CameraNumbers:
+        """The camera as plain numbers, computed once: a training renders a view many times."""
+        (fx, _, cx), (_, fy, cy), _ = self.K.tolist()
+        viewmat = self.viewmat.flatten().tolist()
+        return CameraNumbers(viewmat, [fx, fy, cx, cy], self.position.tolist())
+
     def resized(self, width: int, height: int) -> Camera:
-        """Return this camera with the same view at another size, px."""
-        scale = self.K.new_tensor([[width / self.width], [height / self.height], [1.0]])  # [3, 1]
-        return Camera(self.viewmat, self.K * scale, width, height)
+        """Return the camera with the same view at another size, px: one object for each size."""
+        size = width, height
+        if size not in self._of_size:
+            scale = self.K.new_tensor([[width / self.width], [height / self.height], [1.0]])
+            self._of_size[size] = Camera(self.viewmat, self.K * scale, width, height)
+        return self._of_size[size]
+
+    @cached_property
+    def _of_size(self) -> dict[tuple[int, int], Camera]:
+        # A training renders a view at its sizes many times, and the checks of a new camera take as
+        # long as some of the kernels.
+        return {}
 
     def to_camera(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Transform points from the world to the camera.

@@ -104,11 +104,18 @@ class Gaussians:
             points, colors, init_opacity=init_opacity, sh_degree=sh_degree, generator=generator
         )
 
+    def raw(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Return the parameters in the order of `PARAMETERS`, with shN detached.
+
+        The gradient of shN, three quarters of all gradients, is then never computed. The optimizer
+        derives it from the gradient of sh0 (`SplatOptimizer.step`).
+        """
+        return self.means, self.quats, self.scales, self.opacities, self.sh0, self.shN.detach()
+
     def activated(self, *, backend: str = "torch") -> ActivatedGaussians:
         """Apply the activation functions: exp to scales, the logistic function to opacities.
 
-        shN is detached, so that its gradient, three quarters of all gradients, is never computed.
-        The optimizer derives it from the gradient of sh0 (`SplatOptimizer.step`).
+        shN is detached as in `raw`.
 
         Args:
             backend: `torch`, `native` or `auto` (`resolve_backend`). The native backend takes
@@ -122,9 +129,7 @@ class Gaussians:
         """
         activate = implementation("activations", backend).activate
         scales, opacities = activate(self.scales, self.opacities)
-        return ActivatedGaussians(
-            self.means, self.quats, scales, opacities, self.sh0, self.shN.detach()
-        )
+        return ActivatedGaussians(*self.raw())._replace(scales=scales, opacities=opacities)
 
 
 def from_points(

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from xrgs.splat.backend import implementation, resolve_backend
 from xrgs.splat.cameras import Camera
-from xrgs.splat.gaussians import ActivatedGaussians, Gaussians
+from xrgs.splat.gaussians import PARAMETERS, ActivatedGaussians, Gaussians
 from xrgs.splat.settings import RasterSettings
 from xrgs.splat.sh import check_sh_degree
 
@@ -23,6 +23,9 @@ _SHAPES: dict[str, tuple[int, ...]] = {
     "sh0": (1, 3),
     "means2d_offset": (2,),
 }
+
+#: All elements of every offset that `zero_means2d_offset` makes.
+_ZERO = torch.zeros((), dtype=torch.float32)
 
 
 @dataclass(frozen=True)
@@ -86,21 +89,14 @@ def rasterize(
     if sh_degree is None:
         stored = math.isqrt(gaussians.shN.shape[1] + 1) - 1  # K = (degree + 1)^2
         sh_degree = min(settings.sh_degree, stored)
-    backend = backend_for(gaussians.means, backend)
-    # Not `Gaussians.activated`, which cuts shN off from its gradient.
-    activate = implementation("activations", backend).activate
-    scales, opacities = activate(gaussians.scales, gaussians.opacities)
     return rasterize_parameters(
-        gaussians.means,
-        gaussians.quats,
-        scales,
-        opacities,
-        gaussians.sh0,
-        gaussians.shN,
+        *gaussians.raw()[:-1],
+        gaussians.shN,  # which `raw` cuts off from its gradient
         camera,
         settings,
         sh_degree=sh_degree,
-        backend=backend,
+        raw=True,
+        backend=backend_for(gaussians.means, backend),
     )
 
 
@@ -116,6 +112,7 @@ def rasterize_parameters(
     *,
     sh_degree: int,
     means2d_offset: Tensor | None = None,
+    raw: bool = False,
     backend: str = "torch",
 ) -> Render:
     """Render Gaussians into one view (3D Gaussian Splatting, with gsplat's constants).
@@ -127,8 +124,8 @@ def rasterize_parameters(
     Args:
         means: [N, 3] world units.
         quats: [N, 4] wxyz, any length; zero is no rotation.
-        scales: [N, 3] world units, at least 0.
-        opacities: [N] in 0..1.
+        scales: [N, 3] world units, at least 0; their natural logarithms with `raw`.
+        opacities: [N] in 0..1; their logits with `raw`.
         sh0: [N, 1, 3] coefficients of band 0 of the spherical harmonics.
         shN: [N, K - 1, 3] coefficients of the higher bands.
         camera: The view.
@@ -136,6 +133,8 @@ def rasterize_parameters(
         sh_degree: Highest band that is on, at most the bands of shN.
         means2d_offset: [N, 2] px, added to the projected means: its gradient is the image-plane
             gradient that densification reads (with `settings.absgrad`, of absolute values).
+        raw: Whether scales and opacities are raw parameters. The native backend activates them as
+            it reads them, with the bits of `Gaussians.activated` and in less time.
         backend: `torch`, `native` or `auto` (`resolve_backend`).
 
     Returns:
@@ -156,11 +155,18 @@ def rasterize_parameters(
     _check_shapes(named)
     check_sh_degree(sh_degree, shN)
     backend = resolve_backend(backend)
-    if backend == "torch":  # the native backend checks values as it reads them
-        _check_values(named)
-    render: Render = implementation("rasterizer", backend).render(
-        gaussians, camera, settings, sh_degree, means2d_offset
-    )
+    rasterizer = implementation("rasterizer", backend)
+    render: Render
+    if backend == "native":  # which checks values as it reads them
+        function = rasterizer.render_raw if raw else rasterizer.render
+        render = function(gaussians, camera, settings, sh_degree, means2d_offset)
+        return render
+    if raw:
+        activated = implementation("activations", backend).activate(scales, opacities)
+        named |= dict(zip(("scales", "opacities"), activated, strict=True))
+        gaussians = ActivatedGaussians(*(named[name] for name in PARAMETERS))
+    _check_values(named)
+    render = rasterizer.render(gaussians, camera, settings, sh_degree, means2d_offset)
     return render
 
 
@@ -171,7 +177,12 @@ def zero_means2d_offset(count: int) -> Tensor:
         [N, 2] leaf that requires a gradient, float32. All its elements are one number in memory:
         the native backend knows them for zeros and does not read them.
     """
-    return torch.zeros(()).expand(count, 2).requires_grad_()
+    return _ZERO.expand(count, 2).requires_grad_()
+
+
+def is_zero_offset(offset: Tensor | None) -> bool:
+    """Whether an offset is one that `zero_means2d_offset` has made."""
+    return offset is not None and offset.data_ptr() == _ZERO.data_ptr()
 
 
 def backend_for(means: Tensor, backend: str) -> str:

@@ -237,7 +237,8 @@ class Tracker:
         if self._kind == "tensorboard":
             return f"tensorboard --logdir {self._folder}"
         if self._kind == "mlflow":
-            return f"mlflow ui --backend-store-uri {mlflow_uri(self._folder)}"
+            uri = mlflow_uri(self._folder)
+            return f"mlflow ui --backend-store-uri {uri}" if uri.startswith("sqlite:") else uri
         if self._kind == "wandb":
             return f"with WANDB_MODE=offline, `wandb sync {self._folder}/offline-run-*` sends it"
         return str(self._folder)

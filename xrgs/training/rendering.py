@@ -13,7 +13,7 @@ from xrgs.splat.rendering import Render, rasterize_parameters
 
 if TYPE_CHECKING:
     from xrgs.splat.cameras import Camera
-    from xrgs.splat.gaussians import Gaussians
+    from xrgs.splat.gaussians import ActivatedGaussians, Gaussians
     from xrgs.splat.settings import RasterSettings
     from xrgs.training.components import Components, Step
     from xrgs.training.recorder import TrainingRecorder
@@ -71,14 +71,20 @@ class StepRenderer:
         Returns:
             The render at the camera's size. Its evaluations have not been counted yet.
         """
+        raw = not self.components.override("before_render")
         return rasterize_parameters(
-            *self.components.before_render(gaussians.activated(backend=self.backend), step),
+            *(gaussians.raw() if raw else self._activated(gaussians, step)),
             camera,
             self.raster,
             sh_degree=self.sh_degree(step),
             means2d_offset=means2d_offset,
+            raw=raw,
             backend=self.backend,
         )
+
+    def _activated(self, gaussians: Gaussians, step: Step) -> ActivatedGaussians:
+        """The activated Gaussians as the components change them for the step's render."""
+        return self.components.before_render(gaussians.activated(backend=self.backend), step)
 
     @torch.no_grad()
     def photograph(self, gaussians: Gaussians, step: Step) -> Tensor:
@@ -114,7 +120,7 @@ class StepRenderer:
             probe = pixels.new_zeros(camera.height, camera.width, 3).requires_grad_()
             formed = self.components.to_photograph(probe, step)
             (transposed,) = torch.autograd.grad((formed[..., 0] * pixels).sum(), probe)
-        activated = self.components.before_render(gaussians.activated(backend=self.backend), step)
+        activated = self._activated(gaussians, step)
         found = attribute_pixels(
             transposed[..., 0], activated, camera, self.raster, backend=self.backend
         )

@@ -109,6 +109,10 @@ def test_scripts_and_the_network_are_forbidden(opened: Any) -> None:
 def test_a_slider_moves_and_pictures_are_chosen(opened: Any) -> None:
     from selenium.webdriver.common.keys import Keys
 
+    views = "return [...document.querySelector('#views select[aria-label=View]').options]"
+    names = opened.execute_script(f"{views}.map(one => one.textContent)")
+    assert [name.split(", ")[0] for name in names] == ["IMG_009", "IMG_001"], "worst first"
+    assert names[0] < names[1].replace("IMG_001", "IMG_009"), "with their PSNR"
     slider = opened.find_element("css selector", "#views .slider")
     clip = "return document.querySelectorAll('#views .stage img')[1].style.clipPath"
     before = opened.execute_script(clip)

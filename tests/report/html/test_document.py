@@ -14,7 +14,8 @@ import pytest
 from PIL import Image
 
 from tests.report.conftest import MadeStore, configured
-from tests.report.html.conftest import HOSTILE, data_of, make_gaussians, page_of
+from tests.report.html.conftest import HOSTILE, HR, data_of, make_gaussians, page_of
+from xrgs.capture import images
 from xrgs.experiment.store import Store
 from xrgs.report import build
 from xrgs.report.html import document
@@ -50,7 +51,7 @@ def test_the_same_store_gives_the_same_bytes(copied: Path, page: Path) -> None:
 def test_everything_of_the_store_is_there(page: Path) -> None:
     data = data_of(page)
     labels = ["baseline", "consistency", HOSTILE]
-    assert [view["view"] for view in data["views"]] == ["IMG_001", "IMG_009"]
+    assert [view["view"] for view in data["views"]] == ["IMG_009", "IMG_001"], "worst first"
     for entry in data["views"] + data["training"]:
         assert [arm["label"] for arm in entry["arms"]] == labels
         urls = [data["images"][arm["image"]] for arm in entry["arms"]]
@@ -134,8 +135,19 @@ def test_pictures_none_has_the_tables_alone(copied: Path) -> None:
     page = build(copied, pictures=[]).folder / "report.html"
     data = data_of(page)
     assert data["images"] == data["models"] == data["training"] == []
-    assert [view["view"] for view in data["views"]] == ["IMG_001", "IMG_009"]
+    assert [view["view"] for view in data["views"]] == ["IMG_009", "IMG_001"]
     assert "--pictures none" in page.read_text()
+
+
+@pytest.mark.slow
+def test_a_photograph_says_how_much_a_mask_hides(copied: Path) -> None:
+    (home,) = copied.glob("variants/0123*/images/test")
+    mask = np.ones(HR[::-1], bool)
+    mask[: HR[1] // 4] = False
+    home.with_name("test-masks").mkdir()
+    images.save_mask(home.with_name("test-masks") / "IMG_001.png", mask)
+    views = data_of(page_of(copied))["views"]
+    assert [(view["view"], view["hidden"]) for view in views] == [("IMG_009", 0), ("IMG_001", 0.25)]
 
 
 @pytest.mark.slow
@@ -154,7 +166,7 @@ def test_a_damaged_file_costs_what_it_shows_alone(copied: Path, damaged: str, sa
     assert len(data["notes"]) == 1
     assert said in data["notes"][0]
     assert str(copied) not in data["notes"][0]
-    others = [arm["label"] for arm in data["views"][1]["arms"] if "image" in arm]
+    others = [arm["label"] for arm in data["views"][0]["arms"] if "image" in arm]
     assert others == ["baseline", "consistency", HOSTILE]
 
 

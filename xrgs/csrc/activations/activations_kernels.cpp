@@ -31,25 +31,18 @@ void exp_forward(const float* x, float* y, std::int64_t first, std::int64_t last
   map(x, y, first, last, [](Floats a) { return exp(a); });
 }
 
-void exp_backward(const float* v_y, const float* y, float* v_x, std::int64_t first,
-                  std::int64_t last) {
-  map(v_y, y, v_x, first, last, [](Floats gradient, Floats value) { return gradient * value; });
+void logistic_forward(const float* x, float* y, std::int64_t first, std::int64_t last) {
+  map(x, y, first, last, [](Floats a) { return logistic(a); });
 }
 
-// e^-|x| / (1 + e^-|x|) for negative x and 1 / (1 + e^-|x|) for others: nothing overflows, and no
-// value is below the normal numbers, so that it is the same where the processor flushes those to 0.
-void logistic_forward(const float* x, float* y, std::int64_t first, std::int64_t last) {
-  map(x, y, first, last, [](Floats a) {
-    const Floats one = broadcast(1.0f);
-    const Floats e = exp(-abs(a));
-    return select(a < broadcast(0.0f), e, one) / (one + e);
-  });
+void exp_backward(const float* v_y, const float* y, float* v_x, std::int64_t first,
+                  std::int64_t last) {
+  map(v_y, y, v_x, first, last, [](Floats v, Floats value) { return exp_gradient(v, value); });
 }
 
 void logistic_backward(const float* v_y, const float* y, float* v_x, std::int64_t first,
                        std::int64_t last) {
-  map(v_y, y, v_x, first, last,
-      [](Floats gradient, Floats value) { return gradient * (value * (broadcast(1.0f) - value)); });
+  map(v_y, y, v_x, first, last, [](Floats v, Floats value) { return logistic_gradient(v, value); });
 }
 
 }  // namespace

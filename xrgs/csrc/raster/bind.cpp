@@ -115,7 +115,7 @@ bool all_finite(const float* p, std::size_t count) {
 }
 
 // Finds the parameter that made a render fail, and throws an error that names it.
-[[noreturn]] void throw_invalid_parameter(const ParameterTensors& t) {
+[[noreturn]] void throw_invalid_parameter(const ParameterTensors& t, bool raw) {
   const auto check = [](const char* name, const auto& array) {
     if (!all_finite(array.data(), array.size()))
       throw nb::value_error((std::string(name) + " has values that are not finite").c_str());
@@ -127,9 +127,13 @@ bool all_finite(const float* p, std::size_t count) {
   check("sh0", t.sh0);
   check("shN", t.shN);
   if (t.means2d_offset) check("means2d_offset", *t.means2d_offset);
-  for (std::size_t i = 0; i < t.scales.size(); ++i)
-    if (t.scales.data()[i] < 0.0f) throw nb::value_error("scales has values below 0");
-  for (std::size_t i = 0; i < t.opacities.size(); ++i)
+  for (std::size_t i = 0; i < t.scales.size(); ++i) {
+    const float scale = t.scales.data()[i];
+    if (raw && !std::isfinite(std::exp(scale)))
+      throw nb::value_error("scales has values that are not finite");
+    if (!raw && scale < 0.0f) throw nb::value_error("scales has values below 0");
+  }
+  for (std::size_t i = 0; !raw && i < t.opacities.size(); ++i)
     if (t.opacities.data()[i] < 0.0f || t.opacities.data()[i] > 1.0f)
       throw nb::value_error("opacities has values outside 0..1");
   throw nb::value_error("sh0 and shN overflow: a colour is above 1e38");
@@ -177,7 +181,7 @@ std::tuple<Output, Output> forward(FrameHandle& frame, const RenderConfig& confi
     }
   }
   if (!allocation_ok) throw_out_of_memory(*frame);
-  if (!params_valid) throw_invalid_parameter(tensors);
+  if (!params_valid) throw_invalid_parameter(tensors, config.raw);
   return {std::move(image), std::move(alpha)};
 }
 
@@ -274,7 +278,7 @@ RenderConfig make_config(const Matrix4& viewmat, const std::array<float, 4>& int
                          int height, float near, float eps2d, float alpha_min, float alpha_max,
                          float transmittance_min, bool antialiased, bool absgrad,
                          const std::array<float, 3>& background, int sh_degree,
-                         const std::array<bool, 5>& culling) {
+                         const std::array<bool, 5>& culling, bool raw) {
   if (width < 1 || height < 1) throw nb::value_error("width and height must be at least 1");
   if (sh_degree < 0 || sh_degree > 3) throw nb::value_error("sh_degree must be 0 to 3");
   RenderConfig config;
@@ -300,6 +304,7 @@ RenderConfig make_config(const Matrix4& viewmat, const std::array<float, 4>& int
   config.transmittance_min = transmittance_min;
   config.antialiased = antialiased;
   config.absgrad = absgrad;
+  config.raw = raw;
   config.sh_degree = sh_degree;
   config.culling = {culling[0], culling[1], culling[2], culling[3], culling[4]};
   check_finite(config);
@@ -343,10 +348,12 @@ void bind_raster(nb::module_& m) {
       .def(nb::new_(&make_config), nb::kw_only(), "viewmat"_a, "intrinsics"_a, "width"_a,
            "height"_a, "near"_a, "eps2d"_a, "alpha_min"_a, "alpha_max"_a, "transmittance_min"_a,
            "antialiased"_a, "absgrad"_a, "background"_a, "sh_degree"_a, "culling"_a,
+           "raw"_a = false,
            "Collect the arguments of a render.\n\n"
            "viewmat: 16 floats, world to camera, row by row. intrinsics: fx, fy, cx, cy in px.\n"
            "culling: out_of_view, sub_threshold, tiles, blocks, saturated, as in\n"
-           "xrgs.splat.settings.CullingOptions. The others are those of RasterSettings.");
+           "xrgs.splat.settings.CullingOptions. raw: scales are natural logarithms and opacities\n"
+           "logits, and so are their gradients. The others are those of RasterSettings.");
   // Tensors are never converted: a copy of another type would cost more than the render.
   nb::class_<FrameHandle>(m, "Frame",
                           "The memory of one rendered view, from its forward to its backward pass.")

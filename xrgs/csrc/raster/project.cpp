@@ -129,7 +129,7 @@ template <int Degree>
 std::uint32_t project_group(const GaussianParameters& p, const RenderConfig& config,
                             std::int64_t group, int lanes, Frame& frame, float* depths,
                             bool* params_valid) {
-  const GaussianInputs in = load_inputs(p, group, lanes);
+  const GaussianInputs in = load_inputs(p, config.raw, group, lanes);
   if (to_bits(valid_inputs(in)) != 0xffffu) *params_valid = false;
   const Projection o = project_inputs(in, config);
   const Floats log2_opacity = log2(max(o.opacity, broadcast(kSmallestNormal)));

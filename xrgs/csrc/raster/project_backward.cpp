@@ -268,7 +268,7 @@ bool backward_group(const GaussianParameters& p, const Frame& frame, const float
   const RenderConfig& config = frame.config;
   Floats sum[16];
   sum_pair_grads(frame, pair_grads, group, visible, sum);
-  const GaussianInputs in = load_inputs(p, group, lanes);
+  const GaussianInputs in = load_inputs(p, config.raw, group, lanes);
   const Projection o = project_inputs(in, config);
   const ConicGradient v = conic_factor_backward(o, sum);
   Floats v_opacity = sum[kGrad] / o.opacity;  // Eq. 19
@@ -281,6 +281,12 @@ bool backward_group(const GaussianParameters& p, const Frame& frame, const float
   const Vector3 by_direction =
       color_backward<Degree>(p, config, in, derivatives, sum, group, lanes, out, sh_rows, v_color);
   geometry.mean = add_scaled(geometry.mean, broadcast(1.0f), by_direction);
+  if (config.raw) {
+    Vector3& scale = geometry.scale;
+    scale = {exp_gradient(scale.x, in.scale.x), exp_gradient(scale.y, in.scale.y),
+             exp_gradient(scale.z, in.scale.z)};
+    v_opacity = logistic_gradient(v_opacity, in.opacity);
+  }
   const Floats v_offset_x = config.absgrad ? sum[kAbsGradX] : v.mean_x;
   const Floats v_offset_y = config.absgrad ? sum[kAbsGradY] : v.mean_y;
   write_geometry(geometry, v_opacity, v_offset_x, v_offset_y, mask_from_bits(visible), group, lanes,

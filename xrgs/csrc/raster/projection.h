@@ -31,8 +31,7 @@ XRGS_INLINE Vector3 add_scaled(const Vector3& a, Floats k, const Vector3& b) {
 }
 XRGS_INLINE Vector3 times(Floats k, const Vector3& a) { return {k * a.x, k * a.y, k * a.z}; }
 
-// The parameters of sixteen Gaussians, without their colours. Lanes past the last Gaussian are
-// zeros.
+// The activated parameters of sixteen Gaussians, without their colours.
 struct GaussianInputs {
   Vector3 mean, scale;
   Floats qw, qx, qy, qz, opacity, offset_x, offset_y;
@@ -49,14 +48,20 @@ struct PaddedRows {
   }
 };
 
-// Loads the Gaussians group..group+lanes-1.
-XRGS_INLINE GaussianInputs load_inputs(const GaussianParameters& p, std::int64_t group, int lanes) {
+// Loads the Gaussians group..group+lanes-1, and activates them where they are `raw`. Lanes past the
+// last Gaussian read zeros.
+XRGS_INLINE GaussianInputs load_inputs(const GaussianParameters& p, bool raw, std::int64_t group,
+                                       int lanes) {
   GaussianInputs in;
   PaddedRows padded;
   load_triples(padded.of(p.means, group, lanes, 3), in.mean.x, in.mean.y, in.mean.z);
   load_quadruples(padded.of(p.quats, group, lanes, 4), in.qw, in.qx, in.qy, in.qz);
   load_triples(padded.of(p.scales, group, lanes, 3), in.scale.x, in.scale.y, in.scale.z);
   in.opacity = load(padded.of(p.opacities, group, lanes, 1));
+  if (raw) {
+    in.scale = {exp(in.scale.x), exp(in.scale.y), exp(in.scale.z)};
+    in.opacity = logistic(in.opacity);
+  }
   in.offset_x = in.offset_y = broadcast(0.0f);
   if (p.means2d_offset != nullptr) {
     const float* offsets = padded.of(p.means2d_offset, group, lanes, 2);

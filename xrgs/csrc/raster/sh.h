@@ -87,17 +87,22 @@ XRGS_INLINE Vector3 sh_direction_gradient(const Vector3& d, const Floats* coeffi
 }
 
 // Loads sixteen rows of `Width` floats, `stride` apart, as columns. Rows whose bit in `rows` is not
-// set are not read and give zeros.
+// set are not read and give zeros. The last vector of a row overlaps the one before where it would
+// reach past the row: a masked load that crosses a cache line takes several times as long.
 template <int Width>
 XRGS_INLINE void load_columns(const float* p, std::int64_t stride, std::uint32_t rows,
                               Floats* out) {
   for (int c = 0; c < Width; c += 16) {
-    const int width = Width - c < 16 ? Width - c : 16;
+    const int first = c == 0 || c + 16 <= Width ? c : Width - 16;
     Floats r[16];
-    for (int i = 0; i < 16; ++i)
-      r[i] = (rows >> i & 1u) != 0 ? load_first(p + i * stride + c, width) : broadcast(0.0f);
+    for (int i = 0; i < 16; ++i) {
+      const float* row = p + i * stride + first;
+      r[i] = (rows >> i & 1u) == 0 ? broadcast(0.0f)
+             : Width < 16          ? load_first(row, Width)
+                                   : load(row);
+    }
     transpose(r);
-    for (int i = 0; i < width; ++i) out[c + i] = r[i];
+    for (int i = 0; i < 16 && first + i < Width; ++i) out[first + i] = r[i];
   }
 }
 

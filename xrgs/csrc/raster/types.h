@@ -45,6 +45,7 @@ struct RenderConfig {
   float background[3];
   bool antialiased;  // compensate opacities for eps2d (Eq. 10)
   bool absgrad;      // the gradient of means2d_offset sums absolute values over pixels (Eq. 21)
+  bool raw;          // scales are natural logarithms and opacities logits, which are activated here
   int sh_degree;     // the highest degree of the spherical harmonics that is used, 0 to 3
   CullingOptions culling;
 
@@ -53,7 +54,7 @@ struct RenderConfig {
   std::int64_t tile_count() const { return std::int64_t{tile_columns()} * tile_rows(); }
 };
 
-// The Gaussians: activated parameters, float32, contiguous.
+// The Gaussians: float32, contiguous; scales and opacities as RenderConfig::raw says.
 struct GaussianParameters {
   std::int64_t count;           // N
   const float* means;           // [N, 3]

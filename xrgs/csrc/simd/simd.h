@@ -168,6 +168,23 @@ XRGS_INLINE Floats exp(Floats x) {
   return select(x == x, all, x);
 }
 
+// 1 / (1 + e^-x): 0 where it is below 2^-126, NaN for NaN.
+//
+// It is e^-|x| / (1 + e^-|x|) for negative x and 1 / (1 + e^-|x|) for others: nothing overflows,
+// and no value is below the normal numbers, so that it is the same where the processor flushes
+// those to 0.
+XRGS_INLINE Floats logistic(Floats x) {
+  const Floats one = broadcast(1.0f);
+  const Floats e = exp(-abs(x));
+  return select(x < broadcast(0.0f), e, one) / (one + e);
+}
+
+// The derivatives of exp and of logistic, times `gradient`, by their value y.
+XRGS_INLINE Floats exp_gradient(Floats gradient, Floats y) { return gradient * y; }
+XRGS_INLINE Floats logistic_gradient(Floats gradient, Floats y) {
+  return gradient * (y * (broadcast(1.0f) - y));
+}
+
 // For a >= 0: at least sqrt(max(a, 1e-20)), and at most 0.2% more.
 //
 // The approximate inverse square roots of the instruction sets differ. This one starts from the

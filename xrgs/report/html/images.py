@@ -156,34 +156,25 @@ def add_views(
     }
     names = {str(name): list(rows["view"]) for name, rows in views.groupby("cell_id")}
     wanted = [
-        (cells, view)
+        (cells, view, entry)
         for cells in runs(comparison)
-        for view in _worst_first(list(cells["cell_id"]), names, scores)
+        for view, entry in _entries(cells, names, scores)
     ]
-    pixels = sum(_pixels(store, cells, view) for cells, view in wanted) if max_bytes else 0
+    pixels = sum(_pixels(store, cells, view) for cells, view, _ in wanted) if max_bytes else 0
     album = Album(content.images, max_bytes, int(pixels * _WITH_ERROR_MAPS))
     left_out = 0
-    for cells, view in progress(wanted, "encoding views", "view"):
-        entry = _entry(cells, view, scores)
+    for cells, view, entry in progress(wanted, "encoding views", "view"):
         content.views.append(entry)
         if max_bytes:
             found = _read(content, store, cells, view, _title(entry))
             left_out += found is not None and not _add_images(entry, found, album)
+            if "size" in entry:
+                entry["hidden"] = _hidden(_photograph(store, cells, view), tuple(entry["size"]))
     if left_out:
         content.notes.append(
             f"The images of {left_out} of {len(wanted)} test views are left out, for the page's"
             " size; their scores are here, and their renders are in the store."
         )
-
-
-def _worst_first(cell_ids: list[str], names: dict[str, list[str]], scores: _Scores) -> list[str]:
-    """Return the views of the cells of a run, the one with the least mean PSNR first."""
-    found: dict[str, list[float]] = {}
-    for cell_id in cell_ids:
-        for view in names.get(cell_id, ()):
-            psnr = scores[cell_id, view]["psnr"]
-            found.setdefault(view, []).extend([] if psnr is None else [psnr])
-    return sorted(found, key=lambda view: fmean(found[view] or [math.inf]))
 
 
 def _title(entry: dict[str, Any]) -> str:
@@ -206,12 +197,30 @@ def _pixels(store: JoinedStore, cells: pd.DataFrame, view: str) -> int:
     return width * height * (1 + len(cells))
 
 
-def _entry(cells: pd.DataFrame, view: str, scores: _Scores) -> dict[str, Any]:
-    arms = [
-        {"label": shown(label), "scores": scores.get((cell_id, view), dict.fromkeys(VIEW_METRICS))}
-        for cell_id, label in zip(cells["cell_id"], cells["label"], strict=True)
-    ]
-    return run_names(cells.iloc[0]) | {"view": shown(view), "arms": arms}
+def _hidden(photograph: Path, size: tuple[int, int]) -> float:
+    """Return the share of a photograph's pixels that its mask hides; 0 where it has none."""
+    file = photograph.parent.with_name(f"{photograph.parent.name}-masks") / photograph.name
+    try:
+        return float(1 - images.read_mask(file, size).mean())
+    except (UnreadableError, ImageError):
+        return 0.0
+
+
+def _entries(
+    cells: pd.DataFrame, names: dict[str, list[str]], scores: _Scores
+) -> list[tuple[str, dict[str, Any]]]:
+    """Return the views of the cells of a run with their entries, the least mean PSNR first."""
+    found = []
+    for view in dict.fromkeys(v for name in cells["cell_id"] for v in names.get(name, ())):
+        arms = [
+            {"label": shown(label), "scores": scores.get((cell, view), dict.fromkeys(VIEW_METRICS))}
+            for cell, label in zip(cells["cell_id"], cells["label"], strict=True)
+        ]
+        psnr = [arm["scores"]["psnr"] for arm in arms if arm["scores"]["psnr"] is not None]
+        names_of = run_names(cells.iloc[0]) | {"view": shown(view)}
+        entry = names_of | {"arms": arms, "psnr": finite(fmean(psnr)) if psnr else None}
+        found.append((view, entry))
+    return sorted(found, key=lambda one: math.inf if one[1]["psnr"] is None else one[1]["psnr"])
 
 
 def _read(

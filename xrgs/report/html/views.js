@@ -164,8 +164,9 @@ function scoresText(scores) {
 function testPictures(entry) {
   const at = `test view ${entry.view}, ${entry.scene}`;
   const arms = entry.arms.filter((arm) => arm.image !== undefined);
+  const hidden = entry.hidden ? `; a mask hides ${(100 * entry.hidden).toFixed(1)} % of it` : "";
   return [
-    { name: "photograph", caption: `${entry.size[0]} × ${entry.size[1]} px`, image: entry.photograph, alt: `Photograph: ${at}` },
+    { name: "photograph", caption: `${entry.size[0]} × ${entry.size[1]} px${hidden}`, image: entry.photograph, alt: `Photograph: ${at}` },
     ...arms.map((arm) => ({ name: arm.label, label: arm.label, caption: scoresText(arm.scores), image: arm.image, alt: `Render by ${arm.label}: ${at}. ${scoresText(arm.scores)}` })),
     ...arms.map((arm) => ({ name: `error of ${arm.label}`, caption: "", image: arm.error, apart: true, alt: `Error map of ${arm.label}: ${at}` })),
   ];
@@ -189,7 +190,7 @@ function startViewer(id, entries, pictures, name, missing) {
 // Views whose images were left out are in the table of scores alone.
 function startViews() {
   const seen = data.views.filter((entry) => entry.photograph !== undefined);
-  const viewer = startViewer("views-body", seen, testPictures, (entry) => entry.view, "This page has no pictures of test views; the end of the page says why.");
+  const viewer = startViewer("views-body", seen, testPictures, (entry) => (entry.psnr === null ? entry.view : `${entry.view}, ${entry.psnr.toFixed(1)} dB`), "This page has no pictures of test views; the end of the page says why.");
   return { show: (place, label) => viewer.show(seen.indexOf(data.views[place]), label) };
 }
 

@@ -4,6 +4,11 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.utils.dlpack import to_dlpack  # type: ignore[attr-defined]
+
+#: What the kernels take for a tensor: a handle on its memory, without its graph. Of a tensor they
+#: would ask for it by `Tensor.__dlpack__`, which is written in Python and takes ten times as long.
+handle = to_dlpack
 
 
 def require_float32(name: str, value: Tensor) -> None:

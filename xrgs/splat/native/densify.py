@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from xrgs import _native
-from xrgs.splat.native.arguments import require_contiguous, require_float32
+from xrgs.splat.native.arguments import handle, require_contiguous, require_float32
 
 
 def accumulate_statistics(
@@ -34,11 +34,11 @@ def accumulate_statistics(
     require_contiguous("grad2d_sum", grad2d_sum)
     require_contiguous("visible_count", visible_count)
     _native.accumulate_grad2d(
-        means2d_grad.contiguous(),
-        visible.contiguous(),
+        handle(means2d_grad.contiguous()),
+        handle(visible.contiguous()),
         *half_size,
-        grad2d_sum,
-        visible_count,
+        handle(grad2d_sum),
+        handle(visible_count),
         torch.get_num_threads(),
     )
     # So that autograd refuses to use the values from before.

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from xrgs import _native
-from xrgs.splat.native.arguments import require_float32
+from xrgs.splat.native.arguments import handle, require_float32
 from xrgs.splat.ssim import Target
 
 
@@ -59,11 +59,11 @@ class _Photometric(torch.autograd.Function):
         pixel_weight: Tensor | None,
     ) -> Tensor:
         value, gradient = _native.photometric_loss(
-            image.detach().contiguous(),
-            target.image,
-            target.mean,
-            target.variance,
-            pixel_weight,
+            handle(image.contiguous()),
+            handle(target.image),
+            handle(target.mean),
+            handle(target.variance),
+            None if pixel_weight is None else handle(pixel_weight),
             l1,
             ssim,
             ctx.needs_input_grad[0],
@@ -78,4 +78,4 @@ class _Photometric(torch.autograd.Function):
     def backward(ctx: Any, v_loss: Tensor) -> tuple[Tensor, None, None, None, None]:
         (gradient,) = ctx.saved_tensors
         # Without a factor, a pass over the image is saved.
-        return gradient if v_loss == 1 else gradient * v_loss, None, None, None, None
+        return gradient if v_loss.item() == 1 else gradient * v_loss, None, None, None, None

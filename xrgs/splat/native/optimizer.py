@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from xrgs import _native
+from xrgs.splat.native.arguments import handle
 
 if TYPE_CHECKING:
     from xrgs.splat.cameras import Camera
@@ -39,7 +40,8 @@ def step(adam: torch.optim.Adam, camera: Camera | None = None, sh_degree: int = 
     harmonics: tuple[Any, ...] | None = None
     moved: list[Tensor] = []
     if camera is not None and groups["sh0"]["params"][0].grad is not None:
-        harmonics, *moved = _harmonics(adam, groups, camera, sh_degree)
+        harmonics = _harmonics(adam, groups, camera, sh_degree)
+        moved.append(groups["shN"]["params"][0])
     entries = []
     for name, group in groups.items():
         (parameter,) = group["params"]
@@ -47,11 +49,11 @@ def step(adam: torch.optim.Adam, camera: Camera | None = None, sh_degree: int = 
             continue
         state = _adam_state(adam, parameter)
         changing = (parameter, state["exp_avg"], state["exp_avg_sq"])
-        values, exp_avg, exp_avg_sq = (_require_plain(name, tensor) for tensor in changing)
-        gradient = _require_plain(name, parameter.grad)
+        values, exp_avg, exp_avg_sq = (_plain_handle(name, tensor) for tensor in changing)
+        gradient = _plain_handle(name, parameter.grad)
         number = state["step"].add_(1).item()
         entries.append((values, gradient, exp_avg, exp_avg_sq, group["lr"], number))
-        moved += changing
+        moved.append(parameter)
     beta1, beta2 = adam.defaults["betas"]
     threads = torch.get_num_threads()
     _native.adam_step(entries, beta1, beta2, adam.defaults["eps"], threads, harmonics)
@@ -62,21 +64,19 @@ def step(adam: torch.optim.Adam, camera: Camera | None = None, sh_degree: int = 
 
 def _harmonics(
     adam: torch.optim.Adam, groups: dict[str, dict[str, Any]], camera: Camera, sh_degree: int
-) -> tuple[tuple[Any, ...], Tensor, Tensor, Tensor]:
-    """Return the argument that moves shN by the gradient that sh0's implies, and what it moves."""
+) -> tuple[Any, ...]:
+    """Return the argument that moves shN by the gradient that sh0's implies."""
     means, sh0, shN = (groups[name]["params"][0] for name in ("means", "sh0", "shN"))
     state = _adam_state(adam, shN)
-    moved = (shN, state["exp_avg"], state["exp_avg_sq"])
-    argument = (
-        *(_require_plain("shN", tensor) for tensor in moved),
-        _require_plain("means", means),
-        _require_plain("sh0", sh0.grad),
-        camera.position.tolist(),
+    return (
+        *(_plain_handle("shN", x) for x in (shN, state["exp_avg"], state["exp_avg_sq"])),
+        _plain_handle("means", means),
+        _plain_handle("sh0", sh0.grad),
+        camera.numbers.position,
         sh_degree,
         groups["shN"]["lr"],
         state["step"].add_(1).item(),
     )
-    return argument, *moved
 
 
 def _adam_state(adam: torch.optim.Adam, parameter: Tensor) -> dict[str, Tensor]:
@@ -89,11 +89,11 @@ def _adam_state(adam: torch.optim.Adam, parameter: Tensor) -> dict[str, Tensor]:
     return state
 
 
-def _require_plain(name: str, value: Tensor) -> Tensor:
-    """Return a tensor without its graph; ValueError unless float32, contiguous, on the CPU."""
+def _plain_handle(name: str, value: Tensor) -> Any:
+    """Return a tensor's handle; ValueError unless float32, contiguous, on the CPU."""
     if value.dtype != torch.float32 or value.device.type != "cpu" or not value.is_contiguous():
         raise ValueError(
             f"{name} and its gradient must be float32, contiguous, on the CPU for the native"
             f" optimizer, got {value.dtype} on {value.device}, strides {value.stride()}"
         )
-    return value.detach()
+    return handle(value)

@@ -8,7 +8,7 @@ memory again.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import astuple
+from dataclasses import fields
 from typing import Any
 
 import torch
@@ -18,12 +18,14 @@ from torch.autograd.function import once_differentiable
 from xrgs import _native
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import PARAMETERS, ActivatedGaussians
-from xrgs.splat.native.arguments import require_float32
-from xrgs.splat.rendering import Render
+from xrgs.splat.native.arguments import handle, require_float32
+from xrgs.splat.rendering import Render, is_zero_offset
 from xrgs.splat.settings import CullingOptions, RasterSettings
 
 _TILE = 16
 """Side of a tile, px: `kTileSize` of `xrgs/csrc/raster/types.h`."""
+_CULLING = [field.name for field in fields(CullingOptions)]
+"""The options in the order in which `RenderConfig` takes them."""
 _FIRST_PARAMETER = 2
 """Place of the first parameter among the arguments of `_Rasterize.forward`."""
 _SHN_INPUT = _FIRST_PARAMETER + PARAMETERS.index("shN")
@@ -63,6 +65,23 @@ def render(
     return render_culled(gaussians, camera, settings, sh_degree, means2d_offset, CullingOptions())
 
 
+def render_raw(
+    gaussians: ActivatedGaussians,
+    camera: Camera,
+    settings: RasterSettings,
+    sh_degree: int,
+    means2d_offset: Tensor | None,
+) -> Render:
+    """Render as `render` does, from natural logarithms of scales and logits of opacities.
+
+    The kernels activate them as they read them: image and gradients have the bits that `activate`
+    and `render` give, with a pass over memory less in either direction.
+    """
+    return render_culled(
+        gaussians, camera, settings, sh_degree, means2d_offset, CullingOptions(), raw=True
+    )
+
+
 def render_culled(
     gaussians: ActivatedGaussians,
     camera: Camera,
@@ -70,6 +89,8 @@ def render_culled(
     sh_degree: int,
     means2d_offset: Tensor | None,
     culling: CullingOptions,
+    *,
+    raw: bool = False,
 ) -> Render:
     """Render as `render` does, with some kinds of culling off, so that these can be measured.
 
@@ -78,7 +99,7 @@ def render_culled(
     """
     require_float32("means", gaussians.means)
     frame = _native.Frame()
-    view = render_config(camera, settings, sh_degree, culling)
+    view = render_config(camera, settings, sh_degree, culling, raw=raw)
     image, alpha = _Rasterize.apply(frame, view, *gaussians, means2d_offset)
     return Render(
         image=image,
@@ -91,17 +112,21 @@ def render_culled(
 
 
 def render_config(
-    camera: Camera, settings: RasterSettings, sh_degree: int, culling: CullingOptions
+    camera: Camera,
+    settings: RasterSettings,
+    sh_degree: int,
+    culling: CullingOptions,
+    *,
+    raw: bool = False,
 ) -> _native.RenderConfig:
     """Return the config of `_native.Frame.forward`.
 
     Raises:
         ValueError: float32 cannot hold a number of the camera or the settings.
     """
-    K = camera.K.tolist()
     return _native.RenderConfig(
-        viewmat=camera.viewmat.flatten().tolist(),
-        intrinsics=[K[0][0], K[1][1], K[0][2], K[1][2]],
+        viewmat=camera.numbers.viewmat,
+        intrinsics=camera.numbers.intrinsics,
         width=camera.width,
         height=camera.height,
         near=settings.near,
@@ -113,7 +138,8 @@ def render_config(
         absgrad=settings.absgrad,
         background=settings.background,
         sh_degree=sh_degree,
-        culling=astuple(culling),
+        culling=[getattr(culling, name) for name in _CULLING],
+        raw=raw,
     )
 
 
@@ -121,9 +147,8 @@ def _contiguous(tensor: Tensor | None) -> Tensor | None:
     return None if tensor is None else tensor.detach().contiguous()
 
 
-def _is_zero_offset(offset: Tensor | None) -> bool:
-    """Whether an offset is one number in memory that is zero, as `zero_means2d_offset` makes it."""
-    return offset is not None and offset.stride() == (0, 0) and not offset[:1, :1].any()
+def _handles(tensors: Sequence[Tensor | None]) -> list[Any]:
+    return [None if tensor is None else handle(tensor) for tensor in tensors]
 
 
 class _Rasterize(torch.autograd.Function):
@@ -133,21 +158,19 @@ class _Rasterize(torch.autograd.Function):
     def forward(
         ctx: Any, frame: _native.Frame, view: _native.RenderConfig, *inputs: Tensor | None
     ) -> tuple[Tensor, Tensor]:
-        if _is_zero_offset(inputs[-1]):  # its gradient needs no pass over zeros
+        if is_zero_offset(inputs[-1]):  # its gradient needs no pass over zeros
             inputs = (*inputs[:-1], None)
         contiguous = [_contiguous(tensor) for tensor in inputs]
         ctx.frame = frame
         ctx.save_for_backward(*contiguous)
-        image, alpha = frame.forward(view, *contiguous, torch.get_num_threads())
+        image, alpha = frame.forward(view, *_handles(contiguous), torch.get_num_threads())
         return image, alpha
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_image: Tensor, v_alpha: Tensor) -> tuple[Tensor | None, ...]:
         *gradients, all_finite = ctx.frame.backward(
-            v_image.contiguous(),
-            v_alpha.contiguous(),
-            *ctx.saved_tensors,
+            *_handles((v_image.contiguous(), v_alpha.contiguous(), *ctx.saved_tensors)),
             ctx.needs_input_grad[_SHN_INPUT],  # three quarters of all gradients
             torch.get_num_threads(),
             ctx.needs_input_grad[-1],

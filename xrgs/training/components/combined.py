@@ -32,6 +32,10 @@ class Components(tuple[Component, ...]):
 
     __slots__ = ()
 
+    def override(self, hook: str) -> bool:
+        """Whether any component has a hook of its own; without one, the hook is the identity."""
+        return any(_overrides(type(component), hook) for component in self)
+
     def before_training(self, renderer: ViewRenderer) -> None:
         """Call `Component.before_training` of each component in turn."""
         for component in self:
@@ -130,9 +134,7 @@ class Components(tuple[Component, ...]):
         """
         kinds = [type(component) for component in self]
         deciding = [
-            kind.__name__
-            for kind in kinds
-            if any(getattr(kind, hook) is not getattr(Component, hook) for hook in _GROWTH)
+            kind.__name__ for kind in kinds if any(_overrides(kind, hook) for hook in _GROWTH)
         ]
         if deciding and not strategy.asks_components:
             raise XrgsError(
@@ -199,6 +201,10 @@ class Components(tuple[Component, ...]):
     def _named(self) -> list[tuple[str, Component]]:
         """Each component with a name that is unique even where class names are not."""
         return [(f"{i}.{type(component).__name__}", component) for i, component in enumerate(self)]
+
+
+def _overrides(kind: type[Component], hook: str) -> bool:
+    return getattr(kind, hook) is not getattr(Component, hook)
 
 
 def _combined(
