@@ -180,3 +180,15 @@ def test_bad_input_is_named_and_removes_nothing(
     assert code == 1
     assert message in err
     assert cells(tmp_path) == ["abc", "abd"]
+
+
+@pytest.mark.slow
+def test_a_score_on_request_says_what_it_lacks(
+    call_command: Callable[..., tuple[int, str, str]], store: Path
+) -> None:
+    code, out, _ = call_command("store", "rescore", "--store", str(store), "--also", "lpips_vgg")
+    assert code == 1
+    assert "fetch the weights with `xrgs-data lpips --network vgg`" in out
+    code, _, err = call_command("store", "rescore", "--store", str(store), "--also", "nice")
+    assert code == 1
+    assert "--also nice: choose from: lpips_vgg" in err

@@ -33,6 +33,7 @@ MORE_IS_BETTER = {
     "psnr_worst": True,
     "psnr_plain": True,
     "psnr_fitted": True,
+    "lpips_vgg": False,
     "evaluations": False,
 }
 

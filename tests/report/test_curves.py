@@ -123,10 +123,10 @@ def test_the_table_says_what_was_not_reached(made: Any) -> None:
     rows = {row[:2]: row[2:] for row in made_of.rows}
     not_all = "not reached 1 of 2"
     assert rows["fern", "Time, s"] == ("100.0", "25.0", not_all, "")
-    assert rows["fern", "time, % of baseline's whole training"] == ("100", "25", not_all, "")
+    assert rows["fern", "Time, % of baseline's whole training"] == ("100", "25", not_all, "")
     assert rows["fern", "Alpha evaluations, 10^9"] == ("1", "0.25", not_all, "")
     assert rows["horns", "Time, s"] == ("100.0", "75.0", "", "")
-    mean = rows["mean over scenes", "time, % of baseline's whole training"]
+    mean = rows["mean over scenes", "Time, % of baseline's whole training"]
     assert mean == ("100", "50", "not reached", "")  # 25 and 75: each scene counts once
     assert len(rows) == 6 + 6 + 4
     assert next(iter(rows))[1] == "Alpha evaluations, 10^9", "the measure of work"
@@ -145,8 +145,8 @@ def test_a_base_that_falls_has_its_own_first_passage_beside_it(made: Any) -> Non
     assert found.loc["fast", "evaluations_own_share"] == pytest.approx(1.0)
     made_of = table(times(sweep.cells, sweep.done), ["baseline", "fast"], "", "baseline")
     rows = {row[1]: row[2:] for row in made_of.rows}
-    assert rows["% of baseline's own first passage"] == ("100", "100")
-    assert rows["time, % of baseline's own first passage"] == ("100", "50")
+    assert rows["Evaluations, % of baseline's own first passage"] == ("100", "100")
+    assert rows["Time, % of baseline's own first passage"] == ("100", "50")
 
 
 def test_a_time_of_another_machine_is_no_share_of_the_baselines(made: Any) -> None:
@@ -160,8 +160,8 @@ def test_a_time_of_another_machine_is_no_share_of_the_baselines(made: Any) -> No
     made_of = table(times(sweep.cells, sweep.done), ["fast"], "", "baseline")
     rows = {row[1]: row[2] for row in made_of.rows}
     assert rows["Time, s"] == "16.7"
-    assert rows["time, % of baseline's whole training"] == "n/a"
-    assert rows["time, % of baseline's own first passage"] == "n/a"
+    assert rows["Time, % of baseline's whole training"] == "n/a"
+    assert rows["Time, % of baseline's own first passage"] == "n/a"
 
 
 def test_an_ablation_whose_baseline_failed_has_no_time(made: Any) -> None:

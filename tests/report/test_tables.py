@@ -80,7 +80,7 @@ def test_a_second_replicate_brings_columns_and_a_third_one_verdicts(made: Any) -
     assert rows["PSNR, dB"]["verdict"] == "equivalent"
     assert rows["SSIM, %"]["verdict"] == "descriptive"
     assert [row[0] for row in table.rows][:6] == [
-        *("PSNR, dB", "PSNR, views pooled, dB", "PSNR, worst view, dB", "LPIPS, %"),
+        *("PSNR, dB", "PSNR (pooled), dB", "PSNR (worst view), dB", "LPIPS, %"),
         *("Alpha evaluations, %", "Gaussians, %"),
     ]
 

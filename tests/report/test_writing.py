@@ -126,7 +126,7 @@ def test_an_interval_has_two_signed_ends() -> None:
 
 def test_a_metric_is_named_with_the_unit_of_its_changes() -> None:
     names = {named(metric) for metric in METRICS}
-    assert {"PSNR, dB", "PSNR, worst view, dB", "LPIPS, %", "SSIM, %", "Memory, %"} <= names
+    assert {"PSNR, dB", "PSNR (worst view), dB", "LPIPS, %", "SSIM, %", "Memory, %"} <= names
 
 
 @pytest.mark.parametrize(("scenes", "text"), [(0, ""), (2, " (2 of 3)"), (3, "")])

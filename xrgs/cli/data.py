@@ -62,15 +62,20 @@ def download(
     say(fetch_scenes(replace(DatasetConf(**known), **changes), scenes, root))
 
 
-def lpips(source: Annotated[str | None, arg(name="from"), shown_as("FILE|URL")] = None) -> None:
+def lpips(
+    source: Annotated[str | None, arg(name="from"), shown_as("FILE|URL")] = None,
+    network: Literal["alex", "vgg"] = "alex",
+) -> None:
     """Download the weights of LPIPS; without them its rows in tables are n/a.
 
     Args:
         source: The archive or the weights, as a file or at another address.
+        network: `alex`, which every evaluation has, or `vgg`, for `xrgs-store rescore --also
+            lpips_vgg`.
     """
-    from xrgs.evaluation.lpips.download import fetch_weights
+    from xrgs.evaluation.lpips.download import fetch_vgg, fetch_weights
 
-    say(fetch_weights(source))
+    say(fetch_weights(source) if network == "alex" else fetch_vgg(source))
 
 
 def inspect(

@@ -209,7 +209,7 @@ def gc(
     removal.carry_out(Store(store), plan_gc(Store(store), Store(store).cell_rows(), of))
 
 
-def rescore(cells: Filter) -> None:
+def rescore(cells: Filter, also: Names = ()) -> None:
     """Score done cells anew where a metric was added or changed; nothing is trained.
 
     The cells' Gaussians are rendered and scored by the installed metrics. Cells whose scores are of
@@ -217,13 +217,15 @@ def rescore(cells: Filter) -> None:
 
     Args:
         cells: The cells that pass all of these options.
+        also: Slow scores to add: lpips_vgg, which takes 3 s for a view of 500 x 375 px. Its weights
+            are fetched by `xrgs-data lpips --network vgg`.
     """
     from xrgs.experiment import rescoring
 
     set_passive_openmp_wait()
     _, chosen = cells.chosen()
     done = [cell.folder for cell in chosen if cell.folder.status_file.exists()]
-    scored = rescoring.rescore(Store(cells.store), done)
+    scored = rescoring.rescore(Store(cells.store), done, also)
     say(str(scored))
     if scored.left:
         sys.exit(1)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from functools import cache
 from typing import TYPE_CHECKING
 
-from xrgs.evaluation.metrics import METRICS
+from xrgs.evaluation.metrics import METRICS, ON_REQUEST, VIEW_METRICS
 from xrgs.safeio.code import code_digest
 
 if TYPE_CHECKING:
@@ -20,16 +20,28 @@ PROTOCOL = "protocol"
 
 
 @cache
-def scoring_code() -> dict[str, str]:
-    """Return the digest of the protocol and of each score, by name."""
-    scores = {metric.name: code_digest(*metric.sources) for metric in METRICS if metric.score}
+def scoring_code(also: frozenset[str] = frozenset()) -> dict[str, str]:
+    """Return the digest of the protocol and of each score, by name.
+
+    Args:
+        also: Scores of `ON_REQUEST` to include.
+    """
+    wanted = {*VIEW_METRICS, *also}
+    scores = {m.name: code_digest(*m.sources) for m in METRICS if m.name in wanted}
     return {PROTOCOL: code_digest("evaluation/protocol.py"), **scores}
 
 
-def stale_scores(scored_by: Mapping[str, str]) -> list[str]:
+def stale_scores(scored_by: Mapping[str, str], also: frozenset[str] = frozenset()) -> list[str]:
     """Return which of a cell's scores the installed code would compute otherwise, or lacks.
 
     Args:
         scored_by: The digests in the cell's `status.json`.
+        also: Scores of `ON_REQUEST` that are lacking too where the cell has none.
     """
-    return [name for name, code in scoring_code().items() if scored_by.get(name) != code]
+    known = scoring_code(also | on_request(scored_by))
+    return [name for name, code in known.items() if scored_by.get(name) != code]
+
+
+def on_request(scored_by: Mapping[str, str]) -> frozenset[str]:
+    """Return the scores of `ON_REQUEST` that a cell has."""
+    return ON_REQUEST & scored_by.keys()

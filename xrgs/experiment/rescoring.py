@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from xrgs.errors import StoreError, XrgsError
-from xrgs.evaluation.scoring import scoring_code, stale_scores
+from xrgs.evaluation.metrics import ON_REQUEST, also_scored
+from xrgs.evaluation.scoring import on_request, scoring_code, stale_scores
 from xrgs.experiment.identity import changed_code
 from xrgs.runtime import lease
 from xrgs.runtime.progress import progress
@@ -42,7 +43,7 @@ class Rescored:
         return "\n".join(map(for_line, lines))
 
 
-def rescore(store: Store, cells: Sequence[CellFolder]) -> Rescored:
+def rescore(store: Store, cells: Sequence[CellFolder], also: Sequence[str] = ()) -> Rescored:
     """Score done cells anew where their scores lack a metric, or are of other code.
 
     The views are rendered from the cell's Gaussians, as after its training, and `scores.csv` and
@@ -52,15 +53,20 @@ def rescore(store: Store, cells: Sequence[CellFolder]) -> Rescored:
     Args:
         store: The store.
         cells: The cells.
+        also: Scores of `xrgs.evaluation.metrics.ON_REQUEST` to add. A cell that has one keeps it.
 
     Raises:
         StoreError: The store can't be written.
+        XrgsError: A score is none of `ON_REQUEST`.
     """
+    if unknown := sorted(set(also) - ON_REQUEST):
+        raise XrgsError(f"also={unknown[0]}: choose from: {', '.join(sorted(ON_REQUEST))}")
+    added = frozenset(also)
     scored, left, current = [], [], 0
     for cell in progress(cells, "scoring", "cell", len(cells)):
         try:
-            if stale_scores(_done(cell)):
-                _score_under_lease(store, cell)
+            if stale_scores(_done(cell), added):
+                _score_under_lease(store, cell, added)
                 scored.append(cell.id)
             else:
                 current += 1
@@ -85,17 +91,17 @@ def _done(cell: CellFolder) -> dict[str, str]:
     return status.scored_by
 
 
-def _score_under_lease(store: Store, cell: CellFolder) -> None:
+def _score_under_lease(store: Store, cell: CellFolder, also: frozenset[str]) -> None:
     held = lease.acquire(store.leases, cell.id)
     if held is None:
         raise StoreError("a sweep is training it")
     try:
-        _score(cell)
+        _score(cell, also)
     finally:
         held.release()
 
 
-def _score(cell: CellFolder) -> None:
+def _score(cell: CellFolder, also: frozenset[str]) -> None:
     from xrgs.evaluation import protocol
 
     if parts := changed_code(cell.identity()):
@@ -107,9 +113,11 @@ def _score(cell: CellFolder) -> None:
     if file_digest(cell.path / _SPLATS) != cell.status().files[_SPLATS].sha256:
         raise StoreError(f"{_SPLATS} has changed since the cell finished")
     views, settings = cell.dataset().test, cell.config().splat
-    rows = protocol.score_views(cell.gaussians(), views, settings, cell.path / "renders")
+    wanted = also | on_request(cell.status().scored_by)
+    with also_scored(wanted):
+        rows = protocol.score_views(cell.gaussians(), views, settings, cell.path / "renders")
     # A kill between these two writes leaves scores that are not those of the status: the cell is
     # corrupt until it is scored again.
     write_text(cell.path / "scores.csv", table_text(rows))
     renders = [f"renders/{view.name}.png" for view in views]
-    cell.rescored(["scores.csv", *renders], scoring_code())
+    cell.rescored(["scores.csv", *renders], scoring_code(wanted))

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 from xrgs.errors import StoreError, UnreadableError, XrgsError
-from xrgs.evaluation.metrics import METRICS, VIEW_METRICS
+from xrgs.evaluation.metrics import METRICS, ON_REQUEST, VIEW_METRICS
 from xrgs.evaluation.scoring import PROTOCOL, stale_scores
 from xrgs.experiment.cell_folder import CellState
 from xrgs.experiment.provenance import machine
@@ -47,6 +47,8 @@ RECORD_KEYS = [
 ]
 #: The columns that name a cell in the tables of what cells did.
 CELL_KEYS = ["cell_id", "scene", "label", "condition", "variant_seed", "seed"]
+#: Scores of views that a cell may have.
+_SCORES = (*VIEW_METRICS, *sorted(ON_REQUEST))
 #: Columns of `quality.csv`: steps done, time and alpha evaluations so far, Gaussians, mean scores.
 CURVE_COLUMNS = ["step", "seconds", "evaluations", "gaussians", *VIEW_METRICS]
 #: Columns of a history that describe the logged step alone, not the training up to it.
@@ -271,7 +273,7 @@ def _done_columns(cell_id: str, cell: DoneCell) -> dict[str, Any]:
     size = cell.config.variant if cell.config else None
     return {
         **{metric.name: figures[metric.name] for metric in METRICS if metric.name in figures},
-        **{f"{name}_code": scored_by.get(name, "") for name in VIEW_METRICS},
+        **{f"{name}_code": scored_by.get(name, "") for name in _SCORES},
         "state": "done",
         "reason": "",
         "protocol": scored_by.get(PROTOCOL, ""),
@@ -301,16 +303,16 @@ def _views(done: Mapping[str, DoneCell]) -> pd.DataFrame:
         for cell_id, cell in done.items()
         for view, scores in cell.scores
     ]
-    views = pd.DataFrame(rows, columns=["cell_id", "view", *VIEW_METRICS])
+    views = pd.DataFrame(rows, columns=["cell_id", "view", *_SCORES])
     texts: dict[str, Any] = {"cell_id": object, "view": object}
-    return views.astype(texts | dict.fromkeys(VIEW_METRICS, np.float64))
+    return views.astype(texts | dict.fromkeys(_SCORES, np.float64))
 
 
 def _cells(
     rows: Sequence[RecordedCell], columns: Mapping[str, dict[str, Any]], means: pd.DataFrame
 ) -> pd.DataFrame:
     """Return `Sweep.cells`: the rows of the record with the columns of their cells."""
-    texts = ["state", "reason", "protocol", *(f"{name}_code" for name in VIEW_METRICS)]
+    texts = ["state", "reason", "protocol", *(f"{name}_code" for name in _SCORES)]
     texts += ["stale", "machine"]
     numbers = ["validation", "steps", "long_side", "factor", *(metric.name for metric in METRICS)]
     entries = [

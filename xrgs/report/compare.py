@@ -88,7 +88,8 @@ class Design:
         """Return the margin of a metric, in the scale of its effect; 0 where it has none."""
         if metric.unit == "dB":
             return self.margin_psnr
-        return float(np.log1p(self.margin_lpips / 100)) if metric.name == "lpips" else 0.0
+        is_lpips = metric.name in {"lpips", "lpips_vgg"}
+        return float(np.log1p(self.margin_lpips / 100)) if is_lpips else 0.0
 
 
 def scored_by(metric: Metric) -> str:

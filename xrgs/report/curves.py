@@ -146,11 +146,11 @@ def _first_passage(curve: Sequence[Mapping[str, float]], name: str, target: floa
 #: base, and factor and format of the number.
 _ROWS = {
     "evaluations": ("Alpha evaluations, 10^9", 1e-9, ",.3g"),
-    "evaluations_share": ("% of {base}'s whole training", 100.0, ".0f"),
-    "evaluations_own_share": ("% of {base}'s own first passage", 100.0, ".0f"),
+    "evaluations_share": ("Evaluations, % of {base}'s whole training", 100.0, ".0f"),
+    "evaluations_own_share": ("Evaluations, % of {base}'s own first passage", 100.0, ".0f"),
     "seconds": ("Time, s", 1.0, ",.1f"),
-    "seconds_share": ("time, % of {base}'s whole training", 100.0, ".0f"),
-    "seconds_own_share": ("time, % of {base}'s own first passage", 100.0, ".0f"),
+    "seconds_share": ("Time, % of {base}'s whole training", 100.0, ".0f"),
+    "seconds_own_share": ("Time, % of {base}'s own first passage", 100.0, ".0f"),
 }
 
 

