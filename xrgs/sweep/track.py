@@ -14,7 +14,7 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Self
 
 from xrgs.capture import scenes
-from xrgs.errors import StoreError, XrgsError
+from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.runtime.progress import log_line
 from xrgs.safeio.records import as_number, read_table
 from xrgs.sweep.trackers import SINKS, Run, mlflow_uri
@@ -141,15 +141,15 @@ class _Followed:
             Exception: Whatever a package, a server or a disk raises. The next call goes on from
                 what has arrived.
         """
-        written = tuple(self._written())
-        if self.ended or not written or written == self._seen:
+        written = () if self.ended else tuple(self._written())
+        if not written or written == self._seen:
             return
+        state = self.cell.state(verify=False).name
         try:
-            state = self.cell.state(verify=False).name
             found = curves(self.cell, done=state == "done")
         except (StoreError, ValueError) as error:
-            # A file that a new attempt is replacing is read again.
-            self.ended = self.cell.state(verify=False).name == "done"
+            # Read again, if a new attempt is replacing the file or it can't be read now.
+            self.ended = state == "done" and not isinstance(error, UnreadableError)
             if self.ended:
                 log_line(f"{self.cell.id}: it is not tracked: {error}")
             return
@@ -193,7 +193,7 @@ class Tracker:
         self._store = store
         self._folder = store.path / FOLDER / kind
         self._cells: dict[str, _Followed] = {}
-        self._elsewhere: set[str] = set()
+        self._elsewhere: set[str | None] = set()
         """Cells that another sweep trains, and follows."""
         self._failed = self._said = False
         self._stop = threading.Event()
@@ -201,17 +201,18 @@ class Tracker:
 
     def watch(self, plan: Sequence[PlannedCell]) -> None:
         """Set the cells to follow; called again when they change."""
-        cells = dict(self._cells)
         for cell in plan:
-            if cell.cell_id is None:
-                continue
             if cell.state.name == "running":
                 self._elsewhere.add(cell.cell_id)
             elif cell.state.name != "done":  # its other sweep has left it
                 self._elsewhere.discard(cell.cell_id)
-            if cell.cell_id not in cells and cell.cell_id not in self._elsewhere:
-                cells[cell.cell_id] = _Followed(cell, self._store.cell(cell.cell_id))
-        self._cells = cells  # the thread goes over the cells before or after this call
+        ours = {cell.cell_id: cell for cell in plan if cell.cell_id not in self._elsewhere}
+        # A new dict, because the thread goes over the old one.
+        self._cells = {
+            name: self._cells.get(name) or _Followed(cell, self._store.cell(name))
+            for name, cell in ours.items()
+            if name is not None
+        }
 
     def __enter__(self) -> Self:
         if self._kind != "none":
