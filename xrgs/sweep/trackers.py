@@ -31,6 +31,8 @@ NAMES = ("scene", "label", "condition", "variant_seed", "seed")
 _MAX_PARAMS = 100
 #: The project of Weights & Biases and the experiment of MLflow.
 _PROJECT = "xrgs"
+#: Seconds after which the process of Weights & Biases writes what it was given.
+_WANDB_S = 0.2
 #: The variable that names MLflow's server.
 _SERVER = "MLFLOW_TRACKING_URI"
 
@@ -219,15 +221,16 @@ class _Wandb:
     def _open(self) -> Any:
         import wandb
 
-        # It would ask for a key on the terminal of the sweep.
         settings = wandb.Settings(
             console="off",
             disable_code=True,
             disable_git=True,
             silent=True,
             x_disable_stats=True,
+            x_transaction_log_flush_interval=_WANDB_S,
         )
         offline = wandb.setup(settings).settings.mode != "online"
+        # Without a key `init` would ask for one on the terminal of the sweep.
         if not offline and not wandb.login(prompt=False):
             raise RuntimeError("no key is set: call `wandb login`, or set WANDB_MODE=offline")
         return wandb.init(
@@ -247,6 +250,8 @@ class _Wandb:
         self._step = step
 
     def flush(self) -> None:
+        # A kill loses what W&B's own process has not written yet. It says nothing when it has.
+        time.sleep(2 * _WANDB_S)
         write_json(self._mark, self._step, durable=False)
 
     def close(self, state: str) -> None:
