@@ -13,10 +13,14 @@ import pytest
 from xrgs.capture import variant
 from xrgs.experiment.cell_folder import CellFolder
 from xrgs.experiment.store import Store
+from xrgs.safeio.records import read_table
 
 pytestmark = pytest.mark.slow
 
-SMOKE = ("scene=motorcycle", "preset=smoke", "train.steps=2", "+ablation=consistency")
+SMOKE = (
+    *("scene=motorcycle", "preset=smoke", "train.steps=2", "+ablation=consistency"),
+    "track=csv",
+)
 RunCommand = Callable[..., tuple[int, str, str]]
 
 
@@ -61,6 +65,16 @@ def test_a_config_is_written_once(swept: tuple[Any, str], store: Store) -> None:
     files |= set((folder / "disk").rglob("*.json"))
     with_config = {file.resolve() for file in files if has_config(json.loads(file.read_text()))}
     assert with_config == {folder / "disk" / name / "config.json" for name in names}
+
+
+def test_the_curves_of_each_cell_are_tracked(store: Store) -> None:
+    for cell in store.cell_folders():
+        (file,) = (store.path / "tracking" / "csv").glob(f"*--{cell.id}.csv")
+        header, rows = read_table(file)
+        table = [dict(zip(header, row, strict=True)) for row in rows]
+        losses = [float(row["value"]) for row in table if row["series"] == "history/loss"]
+        assert losses == list(cell.history()["loss"])
+        assert {"score/psnr", "score/gaussians"} <= {row["series"] for row in table}
 
 
 def test_cells_on_another_disk_are_found_by_every_command(

@@ -212,7 +212,7 @@ def _entries(
     """Return the views of the cells of a run with their entries, the least mean PSNR first."""
     found = []
     for view in dict.fromkeys(v for name in cells["cell_id"] for v in names.get(name, ())):
-        arms = [
+        arms: list[dict[str, Any]] = [
             {"label": shown(label), "scores": scores.get((cell, view), dict.fromkeys(VIEW_METRICS))}
             for cell, label in zip(cells["cell_id"], cells["label"], strict=True)
         ]
