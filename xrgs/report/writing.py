@@ -188,7 +188,6 @@ def legend(comparison: Comparison) -> TextTable:
     """Return the table that says what the columns and marks of the tables of changes mean."""
     design, base = comparison.design, comparison.base
     outcomes = ", ".join(m.label for m in comparison.metrics if m.name in design.outcomes)
-    with_p = f"at least {MIN_VALUES} values"
     rows = (
         ("change", f"mean over scenes of the means over replicates: the difference from {base} in"
                    f" dB, or the mean log(value / {base}) in percent"),
@@ -200,8 +199,8 @@ def legend(comparison: Comparison) -> TextTable:
         ("same sign (p)", "scenes that change as their mean does, and the p of the exact sign"
                           " test; of one scene, replicates"),
         ("q", "Benjamini and Hochberg's rate of false discoveries, from the t-tests of the"
-              f" outcomes of all ablations of a condition, of {with_p}; amounts are corrected apart"
-              " from scores"),
+              f" outcomes of all ablations of a condition, of at least {MIN_VALUES} values; amounts"
+              " are corrected apart from scores"),
         *((("p (Holm)", f"the p of {', '.join(design.headline)}, corrected by Holm instead of q"),)
           if design.headline else ()),
         ("better, worse *", f"q, or the p of Holm, is at most {LEVEL:g}"),
