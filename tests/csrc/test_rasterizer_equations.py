@@ -7,6 +7,7 @@ names are those of the page, and comments give the numbers of its equations.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import pytest
 import torch
@@ -219,7 +220,7 @@ def test_the_equations_are_those_of_the_torch_rasterizer(
     background = (0.2, 0.5, 0.9)
     expected: dict[str, Tensor] = {}
     for absgrad in (True, False):
-        leaves = {name: scene[name].clone().requires_grad_() for name in NAMES}
+        leaves: dict[str, Any] = {name: scene[name].clone().requires_grad_() for name in NAMES}
         offset = torch.zeros(N, 2, dtype=torch.float64, requires_grad=True)
         raster = RasterSettings(antialiased=antialiased, background=background, absgrad=absgrad)
         render = rasterize_parameters(
