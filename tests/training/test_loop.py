@@ -337,6 +337,7 @@ def test_the_budget_counts_by_pixels_of_the_largest_view(data: Dataset) -> None:
 ACTS_HERE = {
     "natural_selection": ("components.natural_selection.budget=0.01",),
     "near_limit": ("components.floaters.near_share=1.2",),
+    "hr_share": ("train.hr_share=0.8",),  # half of the views are HR already
 }
 
 

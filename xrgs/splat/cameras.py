@@ -89,18 +89,9 @@ class Camera:
         return CameraNumbers(viewmat, [fx, fy, cx, cy], self.position.tolist())
 
     def resized(self, width: int, height: int) -> Camera:
-        """Return the camera with the same view at another size, px: one object for each size."""
-        size = width, height
-        if size not in self._of_size:
-            scale = self.K.new_tensor([[width / self.width], [height / self.height], [1.0]])
-            self._of_size[size] = Camera(self.viewmat, self.K * scale, width, height)
-        return self._of_size[size]
-
-    @cached_property
-    def _of_size(self) -> dict[tuple[int, int], Camera]:
-        # A training renders a view at its sizes many times, and the checks of a new camera take as
-        # long as some of the kernels.
-        return {}
+        """Return this camera with the same view at another size, px."""
+        scale = self.K.new_tensor([[width / self.width], [height / self.height], [1.0]])  # [3, 1]
+        return Camera(self.viewmat, self.K * scale, width, height)
 
     def to_camera(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Transform points from the world to the camera.

@@ -179,7 +179,11 @@ def _streams(path: Path, content: bytes, count: int, size: int) -> Iterator[byte
             raise ValueError("its streams do not fit")
         left -= length
         try:
-            yield zstandard.ZstdDecompressor().decompress(content[start : start + packed], length)
+            stream = content[start : start + packed]
+            # The decompressor allocates the size that the stream claims, whatever the limit is.
+            if zstandard.frame_content_size(stream) > length:
+                raise ValueError("its streams do not fit")
+            yield zstandard.ZstdDecompressor().decompress(stream, length)
         except zstandard.ZstdError as error:
             raise ValueError(str(error)) from error
         start += packed
