@@ -158,8 +158,7 @@ def rasterize_parameters(
     rasterizer = implementation("rasterizer", backend)
     render: Render
     if backend == "native":  # which checks values as it reads them
-        function = rasterizer.render_raw if raw else rasterizer.render
-        render = function(gaussians, camera, settings, sh_degree, means2d_offset)
+        render = rasterizer.render(gaussians, camera, settings, sh_degree, means2d_offset, raw=raw)
         return render
     if raw:
         activated = implementation("activations", backend).activate(scales, opacities)

@@ -38,6 +38,8 @@ def render(
     settings: RasterSettings,
     sh_degree: int,
     means2d_offset: Tensor | None,
+    *,
+    raw: bool = False,
 ) -> Render:
     """Render Gaussians into one view as `xrgs.splat.rendering.rasterize_parameters` does.
 
@@ -50,6 +52,9 @@ def render(
         settings: How Gaussians become pixels.
         sh_degree: Highest band of the spherical harmonics that is on.
         means2d_offset: [N, 2] px, added to the projected means; None for zeros.
+        raw: Whether scales and opacities are natural logarithms and logits. The kernels activate
+            them as they read them: image and gradients have the bits that `activate` and `render`
+            give, with a pass over memory less in either direction.
 
     Returns:
         The render, once differentiable in every parameter and the offset. Its backward pass raises
@@ -62,23 +67,8 @@ def render(
             only checked for visible Gaussians.
         MemoryError: The tile lists of the view do not fit in memory.
     """
-    return render_culled(gaussians, camera, settings, sh_degree, means2d_offset, CullingOptions())
-
-
-def render_raw(
-    gaussians: ActivatedGaussians,
-    camera: Camera,
-    settings: RasterSettings,
-    sh_degree: int,
-    means2d_offset: Tensor | None,
-) -> Render:
-    """Render as `render` does, from natural logarithms of scales and logits of opacities.
-
-    The kernels activate them as they read them: image and gradients have the bits that `activate`
-    and `render` give, with a pass over memory less in either direction.
-    """
     return render_culled(
-        gaussians, camera, settings, sh_degree, means2d_offset, CullingOptions(), raw=True
+        gaussians, camera, settings, sh_degree, means2d_offset, CullingOptions(), raw=raw
     )
 
 
