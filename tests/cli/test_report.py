@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import inspect
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from xrgs.cli.report import report
 from xrgs.experiment.store import Store
+from xrgs.report import Design
 
 RunCommand = Callable[..., tuple[int, str, str]]
 
@@ -75,6 +78,12 @@ def test_a_report_tests_the_outcomes_that_are_named(run_command: RunCommand, sto
     code, _, err = run_command(*arguments, "--outcomes", "nice")
     assert code == 1
     assert "--outcomes nice: there is no such metric; choose from: " in err
+
+
+def test_the_margins_of_the_command_are_those_of_a_design() -> None:
+    options = inspect.signature(report).parameters
+    for name in ("margin_psnr", "margin_lpips"):
+        assert options[name].default == getattr(Design, name)
 
 
 def test_a_sweep_that_is_not_there_is_named(call_command: RunCommand, tmp_path: Path) -> None:

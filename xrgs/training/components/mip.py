@@ -133,7 +133,7 @@ class Mip(Component):
     def after_step(self, gaussians: Gaussians, step: Step) -> None:
         """Make the filter part of the Gaussians before step `until`."""
         if not self.baked and replace(step, number=step.number + 1).nominal >= self.until:
-            # Adam's moments stay as they are; our choice. They forget their past within some steps.
+            # Adam's moments stay as they are; our choice.
             self.bake(gaussians)
             self.baked = True
 

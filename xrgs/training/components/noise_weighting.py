@@ -49,7 +49,7 @@ class NoiseWeighting(Component):
     Ours:
 
     - Residuals are compared at one sampling rate. An HR photograph has detail that no LR photograph
-      has, and with it larger residuals: at the photographs' own sizes r_HR / r_v is far above 1. So
+      has, and with it larger residuals: at the photographs' own sizes r_HR / r_v is above 1. So
       the residual of each view is first brought down (antialiased bicubic) to the lowest sampling
       rate of all views.
     - r_v is a running mean over about the last ten steps on the view, of the pixels inside its
