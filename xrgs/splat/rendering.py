@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from xrgs.splat.backend import implementation, resolve_backend
+from xrgs.splat.backend import implementation
 from xrgs.splat.cameras import Camera
-from xrgs.splat.gaussians import PARAMETERS, ActivatedGaussians, Gaussians
+from xrgs.splat.gaussians import ActivatedGaussians, Gaussians
 from xrgs.splat.settings import RasterSettings
 from xrgs.splat.sh import check_sh_degree
 
@@ -154,18 +154,10 @@ def rasterize_parameters(
         named["means2d_offset"] = means2d_offset
     _check_shapes(named)
     check_sh_degree(sh_degree, shN)
-    backend = resolve_backend(backend)
     rasterizer = implementation("rasterizer", backend)
-    render: Render
-    if backend == "native":  # which checks values as it reads them
-        render = rasterizer.render(gaussians, camera, settings, sh_degree, means2d_offset, raw=raw)
-        return render
-    if raw:
-        activated = implementation("activations", backend).activate(scales, opacities)
-        named |= dict(zip(("scales", "opacities"), activated, strict=True))
-        gaussians = ActivatedGaussians(*(named[name] for name in PARAMETERS))
-    _check_values(named)
-    render = rasterizer.render(gaussians, camera, settings, sh_degree, means2d_offset)
+    render: Render = rasterizer.render(
+        gaussians, camera, settings, sh_degree, means2d_offset, raw=raw
+    )
     return render
 
 
@@ -217,13 +209,3 @@ def _check_shape_and_type(
         raise ValueError(f"{name} must be {list(shape)}, got {list(value.shape)}")
     if not value.is_floating_point() or value.dtype != dtype:
         raise ValueError(f"{name} must be of the floating type of means, got {value.dtype}")
-
-
-def _check_values(values: dict[str, Tensor]) -> None:
-    for name, value in values.items():
-        if not torch.isfinite(value).all():
-            raise ValueError(f"{name} has values that are not finite")
-    if (values["scales"] < 0).any():
-        raise ValueError("scales has values below 0")
-    if ((values["opacities"] < 0) | (values["opacities"] > 1)).any():
-        raise ValueError("opacities has values outside 0..1")

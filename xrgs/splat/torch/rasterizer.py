@@ -21,6 +21,7 @@ from xrgs.splat.gaussians import ActivatedGaussians
 from xrgs.splat.rendering import Render
 from xrgs.splat.settings import RasterSettings
 from xrgs.splat.sh import sh_to_colors
+from xrgs.splat.torch.activations import activate
 from xrgs.splat.torch.projection import (
     ProjectedGaussians,
     conic_cholesky,
@@ -46,25 +47,33 @@ def render(
     settings: RasterSettings,
     sh_degree: int,
     means2d_offset: Tensor | None,
+    *,
+    raw: bool = False,
 ) -> Render:
     """Render Gaussians into one view as `xrgs.splat.rendering.rasterize_parameters` does.
 
     Args:
-        gaussians: N Gaussians of one floating type, whose checks have passed.
+        gaussians: N Gaussians of one floating type, whose shapes have been checked.
         camera: The view.
         settings: How Gaussians become pixels.
         sh_degree: Highest band of the spherical harmonics that is on.
         means2d_offset: [N, 2] px, added to the projected means; None for zeros.
+        raw: Whether scales and opacities are natural logarithms and logits.
 
     Returns:
         The render, differentiable in every parameter and the offset.
 
     Raises:
+        ValueError: A parameter has values that are not finite or out of range.
         MemoryError: There are more (tile, Gaussian) pairs than fit in memory.
     """
+    if raw:
+        scales, opacities = activate(gaussians.scales, gaussians.opacities)
+        gaussians = gaussians._replace(scales=scales, opacities=opacities)
     means = gaussians.means
     if means2d_offset is None:
         means2d_offset = means.new_zeros((len(means), 2))
+    _check_values(gaussians._asdict() | {"means2d_offset": means2d_offset})
     visible_ids, projected, attributes = _project_visible(
         gaussians, camera, settings, sh_degree, means2d_offset
     )
@@ -88,6 +97,16 @@ def render(
         buffer_bytes=_bytes(*projected, attributes, *pairs, lists) + canvas_bytes,
         tile_evaluations=evaluations,
     )
+
+
+def _check_values(values: dict[str, Tensor]) -> None:
+    for name, value in values.items():
+        if not torch.isfinite(value).all():
+            raise ValueError(f"{name} has values that are not finite")
+    if (values["scales"] < 0).any():
+        raise ValueError("scales has values below 0")
+    if ((values["opacities"] < 0) | (values["opacities"] > 1)).any():
+        raise ValueError("opacities has values outside 0..1")
 
 
 def _project_visible(
