@@ -157,6 +157,8 @@ function startTradeOffs() {
       return chart(`${score.label}, ${score.higher ? "higher" : "lower"} is better`, series, "Gaussians", score.label);
     });
     body.replaceChildren(...charts);
+    const used = labels.filter((label) => rows.some((row) => row.label === label));
+    document.getElementById("trade-off-legend").replaceChildren(...legend(used));
   };
   onFilter.push(draw);
   draw();

@@ -158,7 +158,7 @@ class Viewer {
 
 function scoresText(scores) {
   const known = data.scores.filter((score) => scores[score.name] !== null);
-  return known.map((score) => `${score.label} ${scores[score.name].toFixed(score.name === "psnr" ? 2 : 4)}`).join("; ");
+  return known.map((score) => `${score.label} ${scores[score.name].toFixed(score.name.startsWith("psnr") ? 2 : 4)}`).join("; ");
 }
 
 function testPictures(entry) {
@@ -215,7 +215,7 @@ function startScores(viewer) {
     }
     const numbers = data.scores.map((score) => {
       const value = arm.scores[score.name];
-      const text = value === null ? "n/a" : value.toFixed(score.name === "psnr" ? 2 : 4);
+      const text = value === null ? "n/a" : value.toFixed(score.name.startsWith("psnr") ? 2 : 4);
       return element("td", { class: "number", "data-value": value ?? "" }, text);
     });
     const row = element("tr", {}, element("td", {}, runName(entry)), element("td", {}, name), element("td", {}, arm.label), ...numbers);
