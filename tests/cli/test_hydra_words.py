@@ -141,8 +141,12 @@ def test_a_scene_with_odd_names_is_swept_and_reported(
     assert len(pictures) == 2
     page = (report / "table.md").read_text()
     assert all(f"](figures/{file.name})" in page and file.name.isascii() for file in pictures)
-    for command, name in (("report", str(Path(*report.parts[-3:]))), ("status", scene.name)):
-        code, out, err = run_command(command, tmp_path, "--store", store)
+    told = str(Path(*report.parts[-3:]))
+    for run, command, name in (
+        (forked_command, "report", told),
+        (run_command, "status", scene.name),
+    ):
+        code, out, err = run(command, tmp_path, "--store", store)
         assert code == 0, err
         assert name in out
 
