@@ -30,7 +30,7 @@ def run(notebook: Any, folder: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[l
     commands = Path(sys.executable).parent  # of this environment, active or not
     monkeypatch.setenv("PATH", f"{commands}{os.pathsep}{os.environ['PATH']}")
     resources = {"metadata": {"path": folder}}
-    NotebookClient(notebook, timeout=300, kernel_name="python3", resources=resources).execute()
+    NotebookClient(notebook, timeout=900, kernel_name="python3", resources=resources).execute()
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", ())]
     data = [output.get("data", {}) for output in outputs]
     texts = [
