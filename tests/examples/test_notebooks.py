@@ -58,9 +58,11 @@ def test_photographs_of_two_sizes_are_trained(
     cameras = dict(zip(procedural.names(12), procedural.viewmats(12), strict=True))
     intrinsics = procedural.intrinsics(*SIZE)
     still_life.render(garden, procedural.TEXTURES, intrinsics, SIZE, cameras)
-    for file in sorted(garden.iterdir())[1::2]:
-        with Image.open(file) as image:
-            image.resize((SIZE[0] // 2, SIZE[1] // 2)).save(file)
+    for index, file in enumerate(sorted(garden.iterdir())):
+        with Image.open(file) as image:  # saved as JPEG: PNGs of xrgs are no photographs
+            half = image.resize((SIZE[0] // 2, SIZE[1] // 2))
+            (half if index % 2 else image).save(file.with_suffix(".jpg"), quality=95)
+        file.unlink()
     notebook = read("train_photographs")
     first = next(cell for cell in notebook.cells if cell.cell_type == "code")
     first.source, lines = re.subn(r"^# (scene = )", r"\1", first.source, flags=re.MULTILINE)
