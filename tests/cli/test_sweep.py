@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,13 +20,14 @@ RunCommand = Callable[..., tuple[int, str, str]]
 SCENE = ("scene=motorcycle", "preset=smoke", "store=s")
 SWEEPS = CONF_DIR / "sweeps" if (CONF_DIR / "sweeps").is_dir() else CONF_DIR.parent / "sweeps"
 #: The sweeps that have every ablation between them.
-WHOLE = ("ablations", "further_ablations")
+WHOLE = ("ablations", "recipes", "further_ablations")
 
 
-def named(sweep: str) -> set[str]:
-    """Return the ablations that a sweep's file names, and the baseline, which all have."""
+def arms(sweep: str) -> set[str]:
+    """Return the labels of the arms that a sweep's file names, and the baseline, which all have."""
     axes = OmegaConf.load(SWEEPS / f"{sweep}.yaml").hydra.sweeper.params
-    return {word.strip() for word in axes["+ablation"].split(",")} | {"baseline"}
+    names = re.findall(r"\[[^]]*\]|\w+", axes["+ablation"])
+    return {name.strip("[]").replace(",", "+") for name in names} | {"baseline"}
 
 
 def labels(plan: str) -> set[str]:
@@ -181,11 +183,11 @@ def test_every_sweep_file_plans(sweep_here: SweepHere, name: str) -> None:
     planned = labels(err)
     assert planned > {"baseline"}
     if name in WHOLE:
-        assert {label.partition(" to ")[0] for label in planned} == named(name)
+        assert {label.partition(" to ")[0] for label in planned} == arms(name)
 
 
 def test_every_ablation_is_in_a_sweep() -> None:
-    swept = set().union(*map(named, WHOLE))
+    swept = {name for sweep in WHOLE for arm in arms(sweep) for name in arm.split("+")}
     assert swept == {file.stem for file in (CONF_DIR / "ablation").glob("*.yaml")}
 
 

@@ -160,7 +160,7 @@ class MadeStore:
         self.rows.append(
             keys
             | {"label": label, "condition": "", "scene": scene, "variant_seed": 0, "seed": seed}
-            | {"error": f"{scene}: 3 of 24 views registered"}
+            | {"error": f"{scene}: 3 of 24 views registered", "state": "not placed"}
         )
 
     def write(self, command: tuple[str, ...] = ("+ablation=consistency",)) -> str:

@@ -16,6 +16,7 @@ import pytest
 
 import xrgs
 from tests.report.conftest import VIEWS, configured, finish_again
+from xrgs.capture.folders import TO_TRY
 from xrgs.errors import StoreError
 from xrgs.report import build
 from xrgs.report.collect import ReportError
@@ -227,6 +228,7 @@ def test_a_sweep_of_which_everything_failed(made: Any) -> None:
     made.write()
     report = build(made.store.path)
     assert "2 of 2 cells gave no number" in report.text
+    assert report.text.count(TO_TRY[1]) == 1
 
 
 def test_another_folder_can_be_asked_for(study: Any, tmp_path: Path) -> None:

@@ -1,8 +1,9 @@
-"""Costs are those of the nearest finished cell of a store, scaled to the cell that is planned."""
+"""Costs are those of the nearest finished cells of a store, scaled to the planned cell."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -111,8 +112,8 @@ def test_steps_threads_and_backend_scale_the_time(past: Past) -> None:
     assert past.cost(native).seconds == pytest.approx(100 / TORCH_SLOWDOWN)
 
 
-def test_pixels_scale_the_time_and_the_memory(past: Past) -> None:
-    past.add(100.0)
+def test_pixels_and_gaussians_scale_the_time_and_the_memory(past: Past) -> None:
+    past.add(100.0, gaussians=90_000)  # as many as a view has pixels
     found = past.cost(variant="large")
     assert found.seconds == pytest.approx(100 * (4 + 1) / 2)
     # The photographs of that variant take 3 GB more, whatever the size of one.
@@ -128,6 +129,22 @@ def test_a_budget_of_gaussians_limits_disk_and_time(past: Past) -> None:
     found, free = past.cost(few), past.cost()
     assert found.disk_bytes == pytest.approx(free.disk_bytes / 4)  # 22,500 of 90,000
     assert found.seconds == pytest.approx(free.seconds * (1 + 0.25) / 2)
+
+
+def test_natural_selection_takes_gaussians_away_late(past: Past) -> None:
+    past.add(100.0, gaussians=90_000)
+    selection = replace(past.conf.components.natural_selection, budget=0.25)
+    components = replace(past.conf.components, natural_selection=selection)
+    found, free = past.cost(replace(past.conf, components=components)), past.cost()
+    assert found.disk_bytes == pytest.approx(free.disk_bytes / 4)
+    mean = (90_000 + 22_500) / 2
+    assert found.seconds == pytest.approx(free.seconds * (90_000 + mean) / (90_000 + 90_000))
+
+
+def test_the_median_of_equally_near_cells_counts(past: Past) -> None:
+    for seconds in (10.0, 12.0, 90.0):
+        past.add(seconds)
+    assert past.cost().seconds == pytest.approx(12)
 
 
 def test_loading_and_scoring_come_on_top(past: Past) -> None:
@@ -156,38 +173,20 @@ def test_damaged_cells_are_left_out(past: Past, spoilt: str) -> None:
     assert past.cost().seconds == pytest.approx(40)
 
 
-@pytest.mark.parametrize(
-    ("views", "hr_share", "pixels"),
-    [
-        ("mixed", 0, 1000 * (10 + 40) / 2),
-        ("mixed", 0.5, 1000 * (10 + 40) / 2),
-        ("mixed", 0.8, 1000 * (0.2 * 10 + 0.8 * 40)),
-        ("hr_only", 0, 40_000),
-        ("lr_only", 0, 10_000),
-        ("lr_only", 0.8, 10_000),
-        ("all_hr", 0, 40_000),
-    ],
-)
-@pytest.mark.parametrize("kept", [500_000, 1 << 28])
-def test_the_sizes_are_those_of_the_views_that_are_trained_on(
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-    views: str,
-    hr_share: float,
-    pixels: float,
-    kept: int,
-) -> None:
-    monkeypatch.setattr(estimate, "KEPT_BYTES", kept)
-    estimate._sizes.cache_clear()
+@pytest.fixture
+def sizes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[Conf], estimate._Sizes]:
+    """The sizes of a cell on a trimmed variant of two HR and two LR views."""
+    estimate._views.cache_clear()
 
-    def view(name: str, split: str, tag: str, side: int) -> SimpleNamespace:
-        return SimpleNamespace(name=name, split=split, tag=tag, width=side, height=side)
+    def view(name: str, split: str, tag: str, side: int, need: float) -> SimpleNamespace:
+        size = {"width": side, "height": side}
+        return SimpleNamespace(name=name, split=split, tag=tag, need=need, **size)
 
     made = [
-        view("a", "train", "HR", 200),
-        view("b", "train", "LR", 100),
-        view("b", "original", "HR", 200),
-        view("c", "test", "HR", 999),
+        *(view(name, "train", "HR", 200, 1.2) for name in "ab"),
+        *(view(name, "train", "LR", 100, 4.8) for name in "cd"),
+        *(view(name, "original", "HR", 200, 1.2) for name in "cd"),
+        view("e", "test", "HR", 999, 1.0),
     ]
 
     def read(folder: Path) -> SimpleNamespace:
@@ -195,9 +194,61 @@ def test_the_sizes_are_those_of_the_views_that_are_trained_on(
         return SimpleNamespace(views=made)
 
     monkeypatch.setattr(frozen, "read_manifest", read)
-    largest = 10_000 if views == "lr_only" else 40_000
-    sizes = estimate._sizes(tmp_path, "k-1", views, hr_share)
-    assert sizes.pixels == pytest.approx(pixels)
-    assert sizes.largest == largest
-    trained = {"mixed": 50_000, "all_hr": 80_000}.get(views, largest)
-    assert sizes.held_bytes == 3 * (trained + 999**2) + min(kept, 24 * trained)
+    return lambda conf: estimate._sizes(tmp_path, "k-1", conf)
+
+
+HR, LR = 200**2, 100**2
+
+
+@pytest.mark.parametrize(
+    ("overrides", "pixels"),
+    [
+        ([], (HR + LR) / 2),
+        (["train.hr_share=0.5"], (HR + LR) / 2),
+        (["train.hr_share=0.8"], 0.8 * HR + 0.2 * LR),
+        (["train.views=hr_only"], HR),
+        (["train.views=lr_only", "train.hr_share=0.8"], LR),
+        (["train.views=all_hr"], HR),
+        # Two HR views are left at least.
+        (["train.validation=0.5"], (HR + LR) / 2),
+        # LR views need 5 times as many pixels a side, and get 3 times as many in half of the steps.
+        (
+            ["components.supersampled.factor=3", "components.supersampled.late_factor=1"],
+            (HR + LR * (9 + 1) / 2) / 2,
+        ),
+        # Of a digital zoom, LR views resolve a fifth of their size; at factor 1 they are whole.
+        (
+            ["components.supersampled.factor=2", "variant.degradation=digital_zoom"],
+            (HR + LR * ((2 / 5) ** 2 + 1) / 2) / 2,
+        ),
+        # HR views at 1/3 of their size in the first tenth of the steps, then 1/2 to a quarter.
+        (
+            ["components.resolution_schedule.start_share=0.4"],
+            (HR * (0.1 / 9 + 0.15 / 4 + 0.75) + LR) / 2,
+        ),
+        (["components.resolution_schedule.start_share=0"], (HR + LR) / 2),  # training refuses it
+    ],
+)
+def test_a_step_renders_the_pixels_that_the_components_ask_for(
+    sizes: Callable[[Conf], estimate._Sizes],
+    compose: Callable[..., Conf],
+    overrides: list[str],
+    pixels: float,
+) -> None:
+    assert sizes(compose(*overrides)).pixels == pytest.approx(pixels, rel=0.03)
+
+
+@pytest.mark.parametrize("views", ["mixed", "hr_only", "lr_only", "all_hr"])
+@pytest.mark.parametrize("kept", [500_000, 1 << 28])
+def test_the_photographs_that_training_holds_are_those_of_its_views(
+    monkeypatch: pytest.MonkeyPatch,
+    sizes: Callable[[Conf], estimate._Sizes],
+    compose: Callable[..., Conf],
+    views: str,
+    kept: int,
+) -> None:
+    monkeypatch.setattr(estimate, "KEPT_BYTES", kept)
+    found = sizes(compose(f"train.views={views}"))
+    assert found.largest == (LR if views == "lr_only" else HR)
+    trained = 2 * {"mixed": HR + LR, "hr_only": HR, "lr_only": LR, "all_hr": 2 * HR}[views]
+    assert found.held_bytes == 3 * (trained + 999**2) + min(kept, 24 * trained)

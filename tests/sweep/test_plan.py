@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from xrgs.capture.folders import TO_TRY
 from xrgs.config import Conf
 from xrgs.experiment.cell_folder import CellState
 from xrgs.experiment.store import BASELINE
@@ -25,6 +26,7 @@ from xrgs.sweep.plan import (
     expected_use,
     identified,
     ready,
+    record,
     unchanged,
     will_fail,
     without_kernels,
@@ -114,6 +116,22 @@ def test_the_plan_says_how_long_the_remaining_training_takes(
     assert "retry=failed" in rows[-1]
     again = [replace(each, conf=replace(each.conf, retry="failed")) for each in plan]
     assert "~18 min" in describe(again).splitlines()[0]
+
+
+def test_a_scene_that_is_not_placed_gets_what_to_try_once(
+    cell: Callable[..., PlannedCell],
+) -> None:
+    failed = replace(cell("a"), cell_id=None, variant_id=None, error="few views", remembered=True)
+    plan = [failed, replace(failed, spec=replace(failed.spec, label="b")), cell("c")]
+    text = describe(plan)
+    assert text.endswith("\n".join(TO_TRY))
+    assert text.count(TO_TRY[0]) == 1
+    own = replace(failed.conf, variant=replace(failed.conf.variant, poses="sparse/0"))
+    other_errors = [replace(failed, remembered=False), replace(failed, conf=own), cell("c")]
+    assert TO_TRY[0] not in describe(other_errors)
+    baseline = replace(cell("d"), spec=CellSpec(BASELINE, "", (), ()))
+    states = [row.state for row in record([*plan, *other_errors, baseline])]
+    assert states == ["not placed", "not placed", None, None, None, None, None]
 
 
 def test_without_kernels_the_plan_says_how_long_torch_takes(

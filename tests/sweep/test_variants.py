@@ -16,6 +16,7 @@ import pytest
 from PIL import Image
 
 from xrgs.capture import variant
+from xrgs.capture.folders import TO_TRY
 from xrgs.config import Conf
 from xrgs.errors import StoreError, XrgsError
 from xrgs.experiment.store import Store, StoreGoneError
@@ -246,9 +247,11 @@ def test_sweeps_of_a_scene_that_sfm_can_not_place(
     assert "  failed     variant not built" in err
     assert "0 of 3 photographs are placed" in err
     assert HINT in err
+    assert err.count(TO_TRY[0]) == table.count(TO_TRY[0]) == 1
     text = describe(read(tmp_path / "s"))
     assert "failed scenes, not tried again; retry=failed tries them again" in text
     assert "  leaves  scene leaves failed: 0 of 3 photographs are placed" in text
+    assert "\n".join(TO_TRY) in text
     retry = ("retry=failed", "fail_fast=true")
     code, table, err = forked_command("sweep", tmp_path, *scene, *retry)
     assert code == 1

@@ -22,6 +22,18 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 _FAILED, _TRIMMED = "failed-", "trimmed-"
+#: What to try where SfM places too few photographs of a scene. The photographs' own pixels come
+#: first, since they cost nothing but time; fewer views come last.
+TO_TRY = (
+    'What to try where too few photographs are placed, in this order ("When a scene fails" in'
+    " docs/your_photographs.md):",
+    "1. variant.sfm.long_side=0: COLMAP gets all pixels of the photographs",
+    "2. variant.sfm.max_num_features=16384: more features in each of them",
+    "3. a smaller variant.factor or a larger variant.hr_fraction: LR photographs keep more detail",
+    "4. other photographs: without those of another place or time, with more between the others",
+    "5. variant.poses=PATH: cameras that COLMAP or another program has found",
+    "6. variant.sfm.min_registered=0.5: go on with half of the photographs",
+)
 
 
 def is_variant(name: str) -> bool:

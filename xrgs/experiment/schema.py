@@ -126,8 +126,9 @@ class RecordedCell(Struct, frozen=True):
     """What the cell is asked to be, known before any cell is trained."""
     error: str | None = None
     """Why the cell can't be trained."""
-    state: Literal["unknown"] | None = None
-    """Set where a file could not be read, so that the cell has no id yet."""
+    state: Literal["unknown", "not placed"] | None = None
+    """`unknown` where a file could not be read, so that the cell has no id yet; `not placed` where
+    SfM has placed too few photographs of its scene."""
 
 
 class SweepRecord(Struct, frozen=True):

@@ -330,7 +330,7 @@ def _cells(
 def _without_cell(row: RecordedCell) -> dict[str, str]:
     """Return state and reason of a row that has no cell: it can't be trained, or not yet."""
     if row.error:
-        return {"state": "failed", "reason": row.error}
+        return {"state": row.state or "failed", "reason": row.error}
     if row.state == "unknown":
         return {"state": "unknown", "reason": _UNKNOWN_VARIANT}
     return {"state": "pending", "reason": "not trained yet: it waits for another cell's count"}

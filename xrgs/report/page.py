@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from xrgs.capture.folders import TO_TRY
 from xrgs.evaluation.metrics import METRICS
 from xrgs.evaluation.scoring import PROTOCOL
 from xrgs.experiment.provenance import MACHINE_KEYS
@@ -335,6 +336,9 @@ def _warnings(sweep: Sweep) -> list[str]:
             f"{pending} of {len(states)} cells are not done yet: the same xrgs-sweep command trains"
             " them. The tables are of the cells that are done."
         )
+    if (states == "not placed").any():
+        heading, *steps = TO_TRY
+        warnings.append(f"{heading} {'; '.join(steps)}.")
     if others := ", ".join(_other_programs(sweep)):
         warnings.append(
             f"Renders of another program: {others}. Their PNGs are scored, and compared with the"

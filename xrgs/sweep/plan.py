@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from xrgs.capture import scenes
+from xrgs.capture.folders import TO_TRY
 from xrgs.experiment.cell_folder import CellState
 from xrgs.experiment.identity import cell_id, cell_identity
 from xrgs.experiment.schema import RecordedCell
@@ -86,6 +87,11 @@ class PlannedCell:
     def unknown(self) -> bool:
         """Whether a file of the store can't be read now, so that the cell is left alone."""
         return self.error is None and self.state.name == "unknown"
+
+    @property
+    def not_placed(self) -> bool:
+        """Whether SfM has placed too few photographs of the cell's scene."""
+        return self.remembered and self.conf.variant.poses is None
 
     @property
     def waits(self) -> bool:
@@ -197,6 +203,8 @@ def describe(plan: Sequence[PlannedCell]) -> str:
     failed = any(cell.remembered or cell.state.name == "failed" for cell in plan)
     if plan[0].conf.retry != "failed" and failed:
         lines.append("failed cells are not trained again; retry=failed trains them again")
+    if any(cell.not_placed for cell in plan):
+        lines += TO_TRY
     if hint := how_to_get([cell.conf.scene for cell in plan if cell.error]):
         lines.append(hint)
     return "\n".join(map(for_line, lines))
@@ -315,10 +323,16 @@ def record(plan: Sequence[PlannedCell]) -> list[RecordedCell]:
             baseline_id=baselines[cell.spec.shared],
             # A report reads the state of a cell with an id itself.
             error=cell.state.reason if _lacks_id_for_now(cell) else cell.error,
-            state="unknown" if _lacks_id_for_now(cell) else None,
+            state=_recorded_state(cell),
         )
         for cell in plan
     ]
+
+
+def _recorded_state(cell: PlannedCell) -> Literal["unknown", "not placed"] | None:
+    if _lacks_id_for_now(cell):
+        return "unknown"
+    return "not placed" if cell.not_placed else None
 
 
 def _lacks_id_for_now(cell: PlannedCell) -> bool:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, TypeVar
 
-from xrgs.capture.folders import failed_scenes, is_variant
+from xrgs.capture.folders import TO_TRY, failed_scenes, is_variant
 from xrgs.errors import StoreError
 from xrgs.experiment.listing import STATES, latest_records
 from xrgs.experiment.store import Store
@@ -145,6 +145,7 @@ def describe(status: StoreStatus) -> str:
         lines += _named(f"{state}:", [_reason(cell) for cell in of_state])
     failed = [f"{key}  {scene}  {why}" for key, scene, why in status.failed_scenes]
     lines += _named("failed scenes, not tried again; retry=failed tries them again", failed)
+    lines += TO_TRY if failed else ()
     changed = Counter(part for cell in stale for part in cell.stale)
     title = f"stale: {counted(len(stale), 'done cell')} of other code or arithmetic than here"
     lines += _named(title, [f"{part}: {counted(n, 'cell')}" for part, n in changed.most_common()])
