@@ -107,7 +107,10 @@ def build_editable(
 
 @contextlib.contextmanager
 def _commit_file() -> Iterator[None]:
-    """Write the commit of the checkout into the package for a while; do nothing elsewhere."""
+    """Write the commit of the checkout into the package for a while; do nothing elsewhere.
+
+    Nothing is written into a checkout that is read-only: the package then has no commit.
+    """
     source = _ROOT / "xrgs" / "experiment" / "commit.py"
     commit = runpy.run_path(str(source))  # the package itself needs what a build does not have
     found = commit["of_checkout"](_ROOT)
@@ -117,6 +120,11 @@ def _commit_file() -> Iterator[None]:
     file = _ROOT / "xrgs" / commit["FILE"]
     try:
         file.write_text(json.dumps(found), "utf-8")
+    except OSError as error:
+        _say(f"{file}: {error.strerror}: the package will not know its commit")
+        yield
+        return
+    try:
         yield
     finally:
         file.unlink(missing_ok=True)

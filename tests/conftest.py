@@ -26,18 +26,27 @@ import numpy as np
 import pytest
 import torch
 
+from tests import forks
 from xrgs import composing, config
+from xrgs.capture import variant
 from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.evaluation.lpips import weights
+from xrgs.experiment.store import Store
 from xrgs.splat.cameras import Camera
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark exhaustive tests as slow too: `-m "not slow"` replaces the `-m` of pyproject.toml."""
+    """Mark exhaustive tests as slow too, and put files with slow tests first.
+
+    `-m "not slow"` replaces the `-m` of pyproject.toml. With `-n`, one worker runs a file: a long
+    one at the end would leave the other workers idle.
+    """
     for item in items:
         if item.get_closest_marker("exhaustive"):
             item.add_marker("slow")
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in slow)
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -158,7 +167,8 @@ def run_command() -> Callable[..., tuple[int, str, str]]:
     """Return a function that runs a command in a process of its own.
 
     Its arguments are (name, folder, *arguments, **environment), the name without "xrgs-"; it
-    returns the exit code, stdout and stderr. `call_command` is faster and will mostly do.
+    returns the exit code, stdout and stderr. `call_command` is faster and will mostly do, and
+    `forked_command` for what has to run apart.
     `sweeps_in` is for sweeps that are killed, or whose child processes are checked.
     """
 
@@ -174,6 +184,25 @@ def run_command() -> Callable[..., tuple[int, str, str]]:
         return done.returncode, done.stdout, done.stderr
 
     return run
+
+
+@pytest.fixture(scope="session")
+def forked_command() -> Iterator[Callable[..., tuple[int, str, str]]]:
+    """Return `run_command` for commands that are forked, which start seconds earlier."""
+    with forks.server() as run:
+        yield run
+
+
+@pytest.fixture(scope="session")
+def smoke_variants(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder `variants` of a store, with the variant of `scene=motorcycle preset=smoke`."""
+    store, conf = (
+        Store(tmp_path_factory.mktemp("smoke")),
+        composed("scene=motorcycle", "preset=smoke"),
+    )
+    store.prepare()
+    variant.build(conf.scene, conf.variant, store.variants, store.scenes)
+    return store.variants
 
 
 @dataclass(frozen=True)

@@ -289,6 +289,17 @@ def test_a_wheel_of_an_sdist_has_the_commit_of_the_sdist(
     assert built == [file.read_text()] == ['{"git": "0123", "git_diff_sha256": null}']
 
 
+def test_a_checkout_that_cannot_be_written_is_built_without_its_commit(
+    backend: Any, scikit_build: ScikitBuild, checkout: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (checkout / "xrgs" / "_commit.json").mkdir()  # the owner of a read-only folder may be root
+    built: list[str] = []
+    scikit_build.inside = lambda: built.append("wheel")
+    backend.build_wheel("dist")
+    assert built == ["wheel"]
+    assert "the package will not know its commit" in capsys.readouterr().err
+
+
 def test_a_build_that_raises_leaves_no_commit_file(
     backend: Any, scikit_build: ScikitBuild, checkout: Path
 ) -> None:

@@ -57,13 +57,15 @@ def test_every_action_is_pinned_to_a_commit() -> None:
 
 def test_the_version_is_the_same_everywhere() -> None:
     version = PROJECT["version"]
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
     assert metadata.version("xrgs") == xrgs.__version__ == version
     changes = (ROOT / "CHANGELOG.md").read_text("utf-8")
-    releases = re.findall(r"^## \[?(\d[\d.]*)\]? - \d{4}-\d{2}-\d{2}$", changes, re.MULTILINE)
+    releases = re.findall(r"^## \[(\d[\d.]*)\] - (\d{4}-\d{2}-\d{2})$", changes, re.MULTILINE)
+    assert releases[0] == (citation["version"], str(citation["date-released"]))
     if Version(version).is_devrelease:
-        assert Version(releases[0]) < Version(version)
+        assert Version(citation["version"]) < Version(version)
     else:
-        assert releases[0] == version
+        assert citation["version"] == version
 
 
 @pytest.mark.parametrize("name", PROJECT["scripts"])

@@ -78,7 +78,7 @@ class Copy:
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def trained(tmp_path_factory: pytest.TempPathFactory, smoke_variants: Path) -> Path:
     """The root of a copy with a store `s` of two trained cells."""
     root = tmp_path_factory.mktemp("trained")
     ignored = shutil.ignore_patterns("__pycache__", "conf", "sweeps")
@@ -87,6 +87,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     sweeps = CONF_DIR / "sweeps"
     shutil.copytree(sweeps if sweeps.is_dir() else CONF_DIR.parent / "sweeps", root / "sweeps")
     shutil.copytree(ROOT / "hydra_plugins", root / "hydra_plugins")
+    shutil.copytree(smoke_variants, root / "s" / "variants")
     Copy(root).run("sweep", "+ablation=consistency", *SMOKE)
     return root
 

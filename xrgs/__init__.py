@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from xrgs.splat.settings import RasterSettings
     from xrgs.training.count_matching import train_cell as train
 
-__version__ = "0.2.0.dev0"
+__version__ = "0.2.0"
 
 __all__ = [
     "Camera",

@@ -143,10 +143,10 @@ def children(monkeypatch: pytest.MonkeyPatch) -> Children:
 
 
 @pytest.fixture(scope="session")
-def swept(run_command: RunCommand, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+def swept(forked_command: RunCommand, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """A folder with a finished smoke sweep in its store `s`, and what was printed."""
     folder = tmp_path_factory.mktemp("swept")
-    code, out, err = run_command("sweep", folder, "+ablation=consistency", *SMOKE, "store=s")
+    code, out, err = forked_command("sweep", folder, "+ablation=consistency", *SMOKE, "store=s")
     assert code == 0, err
     return folder, out
 

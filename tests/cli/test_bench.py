@@ -15,13 +15,13 @@ RunCommand = Callable[..., tuple[int, str, str]]
 
 @pytest.mark.slow
 def test_a_trained_cell_becomes_a_load_of_the_benchmark(
-    run_command: RunCommand, swept: tuple[Path, str]
+    forked_command: RunCommand, swept: tuple[Path, str]
 ) -> None:
     folder, _ = swept
     cell = sorted((folder / "s" / "cells").iterdir())[0]
     view = json.loads((cell / "status.json").read_text())["views"][0]
     save = ("--save", "a.npz", "--cell", str(cell), "--view")
-    code, out, err = run_command("bench", folder, *save, view)
+    code, out, err = forked_command("bench", folder, *save, view)
     assert code == 0, err
     with np.load(folder / "a.npz") as stored:
         count = json.loads((cell / "summary.json").read_text())["gaussians"]
@@ -31,7 +31,7 @@ def test_a_trained_cell_becomes_a_load_of_the_benchmark(
         with Image.open(cell / "renders" / f"{view}.png") as picture:
             assert picture.size == (stored["width"], stored["height"])
     assert f"{count} Gaussians" in out
-    code, _, err = run_command("bench", folder, *save, "none")
+    code, _, err = forked_command("bench", folder, *save, "none")
     assert code != 0
     assert "--view none: " in err
     assert view in err

@@ -119,7 +119,7 @@ def test_a_path_with_commas_may_end_with_all_folders_below(tmp_path: Path) -> No
 
 @pytest.mark.slow
 def test_a_scene_with_odd_names_is_swept_and_reported(
-    run_command: RunCommand, tmp_path: Path
+    forked_command: RunCommand, run_command: RunCommand, tmp_path: Path
 ) -> None:
     scene = tmp_path / f"-部屋 🙂 {{it's}} 50%=#1; {ACCENT}, a"
     scene.mkdir()
@@ -130,7 +130,7 @@ def test_a_scene_with_odd_names_is_swept_and_reported(
     conf += ["variant.long_side=185", "variant.sfm.reference=false"]
     words = ("+ablation=curriculum", "scene=folder", f"scene.path={scene.name}", *conf)
     store = "st öre, 'a' {b} 🙂"
-    code, out, err = run_command("sweep", tmp_path, *words, f"store={store}")
+    code, out, err = forked_command("sweep", tmp_path, *words, f"store={store}")
     assert code == 0, err
     assert scene.name in out
     home = tmp_path / store
@@ -141,8 +141,12 @@ def test_a_scene_with_odd_names_is_swept_and_reported(
     assert len(pictures) == 2
     page = (report / "table.md").read_text()
     assert all(f"](figures/{file.name})" in page and file.name.isascii() for file in pictures)
-    for command, name in (("report", str(Path(*report.parts[-3:]))), ("status", scene.name)):
-        code, out, err = run_command(command, tmp_path, "--store", store)
+    told = str(Path(*report.parts[-3:]))
+    for run, command, name in (
+        (forked_command, "report", told),
+        (run_command, "status", scene.name),
+    ):
+        code, out, err = run(command, tmp_path, "--store", store)
         assert code == 0, err
         assert name in out
 

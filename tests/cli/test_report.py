@@ -20,6 +20,7 @@ RunCommand = Callable[..., tuple[int, str, str]]
 def test_the_report_is_rebuilt_byte_for_byte(
     run_command: RunCommand, store: Path, contents: Callable[[Path], dict[str, str]]
 ) -> None:
+    """By a process with other hashes, which order sets otherwise."""
     before = contents(store / "reports")
     shutil.rmtree(store / "reports")
     code, out, err = run_command("report", store.parent, "--store", "s")
@@ -39,15 +40,15 @@ def test_the_sweeps_are_listed(call_command: RunCommand, tmp_path: Path) -> None
 
 @pytest.mark.slow
 def test_a_report_has_the_pictures_that_are_named(
-    run_command: RunCommand, store: Path, tmp_path: Path
+    forked_command: RunCommand, store: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
     arguments = ("report", store.parent, "--store", "s", "--out", str(out), "--pictures")
     for pictures, drawn in (("none", []), ("motorcycle--consistency", ["motorcycle--consistency"])):
-        code, _, err = run_command(*arguments, pictures)
+        code, _, err = forked_command(*arguments, pictures)
         assert code == 0, err
         assert [file.stem for file in (out / "figures").iterdir()] == drawn
-    code, _, err = run_command(*arguments, "gone")
+    code, _, err = forked_command(*arguments, "gone")
     assert code == 1
     assert "--pictures gone: there is no picture of that name" in err
     assert "motorcycle--consistency--training" in err
@@ -55,27 +56,29 @@ def test_a_report_has_the_pictures_that_are_named(
 
 @pytest.mark.slow
 def test_a_report_against_another_label_or_none_there_is(
-    run_command: RunCommand, store: Path
+    forked_command: RunCommand, store: Path
 ) -> None:
     arguments = ("report", store.parent, "--store", "s", "--pictures", "none")
-    code, out, err = run_command(*arguments, "--against", "consistency")
+    code, out, err = forked_command(*arguments, "--against", "consistency")
     assert code == 0, err
     assert "baseline against consistency" in out
-    code, _, err = run_command(*arguments, "--against", "gone")
+    code, _, err = forked_command(*arguments, "--against", "gone")
     assert code == 1
     assert "--against gone: the sweep has no such label; choose from: baseline, consistency" in err
 
 
 @pytest.mark.slow
-def test_a_report_tests_the_outcomes_that_are_named(run_command: RunCommand, store: Path) -> None:
+def test_a_report_tests_the_outcomes_that_are_named(
+    forked_command: RunCommand, store: Path
+) -> None:
     arguments = ("report", store.parent, "--store", "s", "--pictures", "none")
     named = ("--outcomes", "lpips", "ssim", "--headline", "consistency", "--margin-lpips", "7")
-    code, out, err = run_command(*arguments, *named)
+    code, out, err = forked_command(*arguments, *named)
     assert code == 0, err
     assert "the outcomes of this report are LPIPS, SSIM" in out
     assert "0.2 dB of PSNR or 7 % of LPIPS" in out
     assert "the p of consistency, corrected by Holm" in out
-    code, _, err = run_command(*arguments, "--outcomes", "nice")
+    code, _, err = forked_command(*arguments, "--outcomes", "nice")
     assert code == 1
     assert "--outcomes nice: there is no such metric; choose from: " in err
 

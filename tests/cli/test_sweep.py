@@ -265,7 +265,7 @@ def test_bad_input_is_named(
     ids=" ".join,
 )
 def test_bad_input_that_a_child_finds_is_named(
-    sweep_here: SweepHere,
+    forked_command: RunCommand,
     tmp_path: Path,
     photographs: Callable[..., Path],
     arguments: list[str],
@@ -276,7 +276,8 @@ def test_bad_input_that_a_child_finds_is_named(
     for file in photographs(tmp_path / "broken", 5).iterdir():
         file.write_bytes(file.read_bytes()[:60])
     photographs(tmp_path / "small", 5, (40, 30))
-    code, out, err = sweep_here("scene=motorcycle", "preset=smoke", *arguments)
+    smoke = ("scene=motorcycle", "preset=smoke", "train.steps=2", "store=s")
+    code, out, err = forked_command("sweep", tmp_path, *smoke, *arguments)
     assert code == 1
     for text in named:
         assert text in out + err

@@ -1,9 +1,11 @@
-"""Tests of `xrgs-sweep` as a user runs it: a process of its own, which trains in others."""
+"""Tests of `xrgs-sweep` as a user runs it: a process of its own, which trains in others.
+
+Both are forks of a process that has imported torch (`tests.forks`).
+"""
 
 from __future__ import annotations
 
 import json
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -52,10 +54,12 @@ def test_a_cell_keeps_all_that_a_reader_may_need(
 
 
 def test_a_second_run_trains_nothing(
-    run_command: RunCommand, store: Path, contents: Contents
+    forked_command: RunCommand, store: Path, contents: Contents
 ) -> None:
     before = contents(store / "cells")
-    code, out, err = run_command("sweep", store.parent, "+ablation=consistency", *SMOKE, "store=s")
+    code, out, err = forked_command(
+        "sweep", store.parent, "+ablation=consistency", *SMOKE, "store=s"
+    )
     assert code == 0, err
     assert "plan: 2 cells, 2 done" in err
     assert "training cell" not in err
@@ -64,20 +68,20 @@ def test_a_second_run_trains_nothing(
 
 
 def test_naming_the_backend_that_auto_chooses_is_no_change(
-    run_command: RunCommand, store: Path
+    forked_command: RunCommand, store: Path
 ) -> None:
     used = json.loads(next((store / "cells").rglob("provenance.json")).read_text())["backend"]
     arguments = ("+ablation=consistency", *SMOKE, "store=s", "dry_run=true")
     for backend, done in (("native", 2), ("torch", 0)) if used == "native" else (("torch", 2),):
-        _, _, err = run_command("sweep", store.parent, *arguments, f"splat.backend={backend}")
+        _, _, err = forked_command("sweep", store.parent, *arguments, f"splat.backend={backend}")
         assert f"plan: 2 cells, {done} done" in err
 
 
 def test_a_count_matched_cell_has_the_gaussians_of_its_reference(
-    run_command: RunCommand, store: Path
+    forked_command: RunCommand, store: Path
 ) -> None:
     control = ("+ablation=count_matched", "matched_to=gradient_scaling", *SMOKE, f"store={store}")
-    code, out, err = run_command("sweep", store.parent, *control)
+    code, out, err = forked_command("sweep", store.parent, *control)
     assert code == 0, err
     assert err.count("training cell") == 2
     assert "3 of 3 cells done" in err
@@ -87,25 +91,25 @@ def test_a_count_matched_cell_has_the_gaussians_of_its_reference(
     matched = [conf["components"]["count_matched"]["gaussians"] for conf in configs]
     counts = [json.loads(f.read_text())["gaussians"] for f in store.glob("cells/*/summary.json")]
     assert max(matched) in counts
-    _, _, err = run_command("sweep", store.parent, *control)
+    _, _, err = forked_command("sweep", store.parent, *control)
     assert "plan: 3 cells, 3 done" in err
 
 
-def test_a_moved_store_is_no_change(run_command: RunCommand, store: Path) -> None:
+def test_a_moved_store_is_no_change(forked_command: RunCommand, store: Path) -> None:
     store.rename(store.with_name("moved"))
     arguments = ("+ablation=consistency", *SMOKE, "threads=1", "data_root=x", "scene.name=y")
-    _, _, err = run_command("sweep", store.parent, *arguments, "store=moved", "dry_run=true")
+    _, _, err = forked_command("sweep", store.parent, *arguments, "store=moved", "dry_run=true")
     assert "2 done" in err
 
 
 def test_a_corrupt_cell_is_trained_again(
-    run_command: RunCommand, store: Path, contents: Contents
+    forked_command: RunCommand, store: Path, contents: Contents
 ) -> None:
     cell = sorted((store / "cells").iterdir())[0]
     before = contents(cell)
     scores = cell / "scores.csv"
     scores.write_text(scores.read_text().replace("0.", "0.9", 1))
-    code, _, err = run_command("sweep", store.parent, "+ablation=consistency", *SMOKE, "store=s")
+    code, _, err = forked_command("sweep", store.parent, "+ablation=consistency", *SMOKE, "store=s")
     assert code == 0
     assert "corrupt" in err
     assert "1 done" in err
@@ -116,12 +120,12 @@ def test_a_corrupt_cell_is_trained_again(
 
 
 def test_a_scene_that_fails_leaves_the_other_scenes(
-    run_command: RunCommand, store: Path, photographs: Callable[..., Path]
+    forked_command: RunCommand, store: Path, photographs: Callable[..., Path]
 ) -> None:
     flat = photographs(store.parent / "flat", 6)
     scenes = ("scene=motorcycle,folder", f"scene.path={flat}")
     arguments = ("+ablation=consistency", *SMOKE[1:], *scenes, "store=s")
-    code, out, err = run_command("sweep", store.parent, *arguments)
+    code, out, err = forked_command("sweep", store.parent, *arguments)
     assert code == 1
     assert "flat" in err
     assert "registered" in err
@@ -130,17 +134,14 @@ def test_a_scene_that_fails_leaves_the_other_scenes(
 
 
 def test_the_child_imports_the_package_of_its_parent_and_not_that_of_its_folder(
-    store: Path,
+    tmp_path: Path,
 ) -> None:
-    shutil.rmtree(store / "cells")
-    (store.parent / "xrgs").mkdir()
-    (store.parent / "xrgs" / "__init__.py").write_text("raise ImportError('the wrong package')")
-    script = "import sys; sys.path.remove(''); from xrgs.cli.sweep import main; main()"
+    (tmp_path / "xrgs").mkdir()
+    (tmp_path / "xrgs" / "__init__.py").write_text("raise ImportError('the wrong package')")
+    script = "import sys; sys.path.remove(''); from xrgs.sweep.jobs.worker import run_in_child; "
+    script += "run_in_child('cell', {'cell': 'gone', 'inode': 0})"
     done = subprocess.run(
-        [sys.executable, "-c", script, *SMOKE, "train.steps=2", "store=s"],
-        cwd=store.parent,
-        capture_output=True,
-        text=True,
-        check=False,
+        [sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=False
     )
-    assert done.returncode == 0, done.stderr
+    assert "AttemptLostError: gone: another attempt at the cell has begun" in done.stderr
+    assert "the wrong package" not in done.stderr

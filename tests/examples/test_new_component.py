@@ -64,8 +64,9 @@ def example(
 
 
 @pytest.fixture(scope="module")
-def swept(example: Installed) -> tuple[int, str, str]:
+def swept(example: Installed, smoke_variants: Path) -> tuple[int, str, str]:
     """A sweep with the example's own ablation file."""
+    shutil.copytree(smoke_variants, example.folder / "s" / "variants")
     conf = ("--config-dir", str(example.folder / "new_component" / "conf"))
     return example.sweep(*conf, f"+ablation={NAME}", *CELL)
 

@@ -27,7 +27,6 @@ from xrgs.evaluation.metrics import VIEW_METRICS
 from xrgs.experiment import cell
 from xrgs.experiment.cell_folder import CellFolder
 from xrgs.experiment.identity import cell_id, cell_identity
-from xrgs.experiment.store import Store
 from xrgs.runtime import progress
 from xrgs.runtime.signals import StopRequest, StopSignal
 from xrgs.safeio.atomic import write_json
@@ -199,14 +198,13 @@ def test_an_unusable_checkpoint_is_logged_and_training_starts_over(
 
 @pytest.mark.slow
 def test_a_worker_that_is_killed_goes_on_in_another(
-    compose: Callable[..., Conf], tmp_path: Path
+    compose: Callable[..., Conf], smoke_variants: Path, tmp_path: Path
 ) -> None:
     changes = ("scene=motorcycle", "preset=smoke", "train.steps=100", "threads=1")
     conf = compose(*changes, "checkpoint_s=0.05")
     conf.splat.backend = resolve_backend(conf.splat.backend)
-    store = Store(tmp_path / "s")
-    store.prepare()
-    built = variant.build(conf.scene, conf.variant, store.variants, store.scenes)
+    (frozen,) = smoke_variants.iterdir()
+    built = variant.load(frozen)
 
     folder = begin(conf, tmp_path / "killed", built.id)
     write_json(tmp_path / "request.json", worker.cell_request(built.folder, folder))
@@ -224,7 +222,7 @@ def test_a_worker_that_is_killed_goes_on_in_another(
     log = (folder.path / "log.txt").read_text()
     assert "going on from the checkpoint" in log
     spared = begin(conf, tmp_path / "spared", built.id)
-    worker.run_in_child("cell", worker.cell_request(built.folder, spared))
+    cell.run_cell(conf, built, spared)
     assert results(folder) == results(spared)
     assert folder.status().files.keys() == spared.status().files.keys()
 

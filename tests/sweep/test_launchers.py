@@ -49,18 +49,23 @@ def results(folder: Path) -> dict[str, list[bytes]]:
 
 
 @pytest.fixture(scope="module")
-def basic(tmp_path_factory: pytest.TempPathFactory, sweeps_in: Callable[..., Any]) -> Path:
+def basic(
+    tmp_path_factory: pytest.TempPathFactory,
+    forked_command: Callable[..., tuple[int, str, str]],
+    smoke_variants: Path,
+) -> Path:
     """A folder whose store `s` holds the cells that the basic launcher trained."""
     folder = tmp_path_factory.mktemp("basic")
-    code, _, err = sweeps_in(folder).run(*SMOKE)
+    shutil.copytree(smoke_variants, folder / "s" / "variants")
+    code, _, err = forked_command("sweep", folder, *SMOKE, "store=s", "threads=1")
     assert code == 0, err
     return folder
 
 
 @pytest.fixture
-def folder(basic: Path, tmp_path: Path) -> Path:
+def folder(smoke_variants: Path, tmp_path: Path) -> Path:
     """A folder whose store `s` holds the variant and no cell."""
-    shutil.copytree(basic / "s" / "variants", tmp_path / "s" / "variants")
+    shutil.copytree(smoke_variants, tmp_path / "s" / "variants")
     return tmp_path
 
 

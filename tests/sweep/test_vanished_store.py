@@ -89,10 +89,12 @@ def wait_for(what: Callable[[], object], sweep: Any) -> None:
 )
 def test_a_sweep_whose_store_vanishes_ends_in_order(
     sweeps_in: Callable[..., Any],
+    smoke_variants: Path,
     tmp_path: Path,
     vanishes: Callable[[Path], None],
     launcher: str,
 ) -> None:
+    shutil.copytree(smoke_variants, tmp_path / "s" / "variants")
     sweeps = sweeps_in(tmp_path, WRITES_ON)
     given = ("scene=motorcycle", "preset=smoke", "seed=0,1", f"hydra/launcher={launcher}")
     sweep = sweeps.start(*given)

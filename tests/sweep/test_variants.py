@@ -229,19 +229,18 @@ def test_a_store_that_vanishes_while_a_variant_is_built_does_not_reappear(
 
 @pytest.mark.slow
 def test_sweeps_of_a_scene_that_sfm_can_not_place(
-    sweeps_in: Callable[..., Any], tmp_path: Path
+    forked_command: Callable[..., tuple[int, str, str]], tmp_path: Path
 ) -> None:
     for number in range(3):  # SIFT finds no feature in a flat image
         pixels = np.full((30, 40, 3), 40 + number, np.uint8)
         (tmp_path / "leaves").mkdir(exist_ok=True)
         Image.fromarray(pixels).save(tmp_path / "leaves" / f"{number}.png")
-    sweeps = sweeps_in(tmp_path)
-    scene = ("scene=folder", "scene.path=leaves", "preset=smoke", *CONF)
-    code, table, err = sweeps.run(*scene)
+    scene = ("scene=folder", "scene.path=leaves", "preset=smoke", "store=s", *CONF)
+    code, table, err = forked_command("sweep", tmp_path, *scene)
     assert code == 1
     assert BUILDING in err
     assert "0 of 3 photographs are placed" in table
-    code, second_table, err = sweeps.run(*scene)
+    code, second_table, err = forked_command("sweep", tmp_path, *scene)
     assert code == 1
     assert second_table == table
     assert BUILDING not in err
@@ -253,7 +252,8 @@ def test_sweeps_of_a_scene_that_sfm_can_not_place(
     assert "failed scenes, not tried again; retry=failed tries them again" in text
     assert "  leaves  scene leaves failed: 0 of 3 photographs are placed" in text
     assert "\n".join(TO_TRY) in text
-    code, table, err = sweeps.run(*scene, "retry=failed", "fail_fast=true")
+    retry = ("retry=failed", "fail_fast=true")
+    code, table, err = forked_command("sweep", tmp_path, *scene, *retry)
     assert code == 1
     assert BUILDING in err
     assert HINT not in err

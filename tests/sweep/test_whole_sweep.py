@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
+import shutil
 import tarfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -19,29 +19,32 @@ pytestmark = pytest.mark.slow
 
 SMOKE = (
     *("scene=motorcycle", "preset=smoke", "train.steps=2", "+ablation=consistency"),
-    "track=csv",
+    *("track=csv", "threads=1", "store=s"),
 )
 RunCommand = Callable[..., tuple[int, str, str]]
 
 
 @pytest.fixture(scope="module")
 def swept(
-    tmp_path_factory: pytest.TempPathFactory, sweeps_in: Callable[..., Any]
-) -> tuple[Any, str]:
-    """A finished sweep of two cells, whose folder `cells` is a link, and the printed table."""
-    sweeps = sweeps_in(tmp_path_factory.mktemp("whole"))
-    (sweeps.folder / "disk").mkdir()
-    (sweeps.folder / "s").mkdir()
-    (sweeps.folder / "s" / "cells").symlink_to(sweeps.folder / "disk")
-    code, table, err = sweeps.run(*SMOKE)
+    tmp_path_factory: pytest.TempPathFactory, forked_command: RunCommand, smoke_variants: Path
+) -> tuple[Path, str]:
+    """A folder with a finished sweep of two cells in its store `s`, and the printed table.
+
+    The store's folder `cells` is a link.
+    """
+    folder = tmp_path_factory.mktemp("whole")
+    (folder / "disk").mkdir()
+    shutil.copytree(smoke_variants, folder / "s" / "variants")
+    (folder / "s" / "cells").symlink_to(folder / "disk")
+    code, table, err = forked_command("sweep", folder, *SMOKE)
     assert code == 0, err
     assert err.count("training cell") == 2
-    return sweeps, table
+    return folder, table
 
 
 @pytest.fixture(scope="module")
-def store(swept: tuple[Any, str]) -> Store:
-    return Store(swept[0].folder / "s")
+def store(swept: tuple[Path, str]) -> Store:
+    return Store(swept[0] / "s")
 
 
 def baseline(store: Store) -> CellFolder:
@@ -57,8 +60,8 @@ def has_config(value: object) -> bool:
     return isinstance(value, list) and any(map(has_config, value))
 
 
-def test_a_config_is_written_once(swept: tuple[Any, str], store: Store) -> None:
-    folder = swept[0].folder
+def test_a_config_is_written_once(swept: tuple[Path, str], store: Store) -> None:
+    folder = swept[0]
     names = [cell.id for cell in store.cell_folders()]
     assert sorted(path.name for path in (folder / "disk").iterdir()) == names
     files = {file for file in folder.rglob("*.json") if "reports" not in file.parts}
@@ -78,24 +81,24 @@ def test_the_curves_of_each_cell_are_tracked(store: Store) -> None:
 
 
 def test_cells_on_another_disk_are_found_by_every_command(
-    swept: tuple[Any, str], store: Store, run_command: RunCommand
+    swept: tuple[Path, str], store: Store, forked_command: RunCommand
 ) -> None:
-    sweeps, table = swept
-    code, again, err = sweeps.run(*SMOKE)
+    folder, table = swept
+    code, again, err = forked_command("sweep", folder, *SMOKE)
     assert code == 0, err
     assert "training cell" not in err
     assert again == table
-    code, listed, err = run_command("store", sweeps.folder, "list", "--store=s")
+    code, listed, err = forked_command("store", folder, "list", "--store=s")
     assert code == 0, err
     assert listed.count("done") == 2
     assert set(store.cells()["state"]) == {"done"}
-    code, report, err = run_command("report", sweeps.folder, "--store=s")
+    code, report, err = forked_command("report", folder, "--store=s")
     assert code == 0, err
     assert report == table
 
 
 def test_the_same_program_gives_the_same_bits(
-    swept: tuple[Any, str], store: Store, run_command: RunCommand, tmp_path: Path
+    swept: tuple[Path, str], store: Store, run_command: RunCommand, tmp_path: Path
 ) -> None:
     original = baseline(store).path
     before = {file: file.stat().st_mtime_ns for file in original.rglob("*")}
@@ -109,21 +112,17 @@ def test_the_same_program_gives_the_same_bits(
 
 
 def test_a_sweep_goes_on_from_a_packed_store(
-    swept: tuple[Any, str],
-    store: Store,
-    sweeps_in: Callable[..., Any],
-    run_command: RunCommand,
-    tmp_path: Path,
+    swept: tuple[Path, str], store: Store, forked_command: RunCommand, tmp_path: Path
 ) -> None:
     cell = baseline(store)
     built, out = cell.identity().variant, tmp_path / "a.tar.xz"
     packed = ("pack", cell.id, f"--store={store.path}", f"--out={out}")
-    assert run_command("store", tmp_path, *packed)[0::2] == (0, "")
+    assert forked_command("store", tmp_path, *packed)[0::2] == (0, "")
     with tarfile.open(out) as archive:
         archive.extractall(tmp_path / "other", filter="data")
     other = Store((tmp_path / "other" / "xrgs-store").rename(tmp_path / "other" / "s"))
     assert [path.name for path in other.variants.iterdir()] == [f"trimmed-{built}"]
-    code, table, err = sweeps_in(tmp_path / "other").run(*SMOKE)
+    code, table, err = forked_command("sweep", tmp_path / "other", *SMOKE)
     assert code == 0
     assert f"variant {built}: making the images again that xrgs-store trim has removed" in err
     assert "building the mixed-resolution variant" not in err

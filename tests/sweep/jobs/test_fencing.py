@@ -55,11 +55,10 @@ def conf(compose: Callable[..., Conf]) -> Conf:
 
 
 @pytest.fixture(scope="module")
-def built(conf: Conf, tmp_path_factory: pytest.TempPathFactory) -> Variant:
+def built(smoke_variants: Path) -> Variant:
     """The cell's variant."""
-    store = Store(tmp_path_factory.mktemp("built") / "s")
-    store.prepare()
-    return variant.build(conf.scene, conf.variant, store.variants, store.scenes)
+    (folder,) = smoke_variants.iterdir()
+    return variant.load(folder)
 
 
 @pytest.fixture

@@ -89,9 +89,12 @@ def files(cell: Path) -> dict[str, tuple[int, bytes]]:
 
 
 @pytest.fixture(scope="module")
-def built(sweeps_in: SweepsIn, tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, Ended]:
+def built(
+    sweeps_in: SweepsIn, tmp_path_factory: pytest.TempPathFactory, smoke_variants: Path
+) -> tuple[Any, Ended]:
     """A store with a sweep of a cell of most faults and a healthy one; how that ended."""
     sweeps = sweeps_in(tmp_path_factory.mktemp("faults"), FAULTS)
+    shutil.copytree(smoke_variants, sweeps.folder / "s" / "variants")
     return sweeps, sweeps.run(*SMOKE, "seed=1,2,3,5,0", "limits.memory_gb=1.2")
 
 

@@ -180,14 +180,16 @@ def results(cell: Path) -> dict[str, Any]:
 
 
 def test_a_sweep_killed_again_and_again_ends_as_if_it_had_not_been(
-    sweeps_in: Callable[[Path], Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    sweeps_in: Callable[[Path], Any],
+    forked_command: Callable[..., tuple[int, str, str]],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     seed = int(os.environ.get("XRGS_KILL_SEED", random.randrange(10**6)))
     moments = drawn(int(os.environ.get("XRGS_KILLS", "2")), random.Random(seed))
     with capsys.disabled():  # whether the test passes or not
         print(f"\nXRGS_KILLS={len(moments)} XRGS_KILL_SEED={seed}", flush=True)  # noqa: T201
     (tmp_path / "killed").mkdir()
-    (tmp_path / "spared" / "s").mkdir(parents=True)
     killed = KilledSweeps(sweeps_in(tmp_path / "killed"))
     for moment in moments:
         start = time.monotonic()
@@ -206,12 +208,12 @@ def test_a_sweep_killed_again_and_again_ends_as_if_it_had_not_been(
     killed.check()
     assert len(killed.finished) == CELLS
 
-    spared = KilledSweeps(sweeps_in(tmp_path / "spared"))
-    shutil.copytree(killed.store / "variants", spared.store / "variants")
-    code, _, err = spared.sweeps.run(*ARGUMENTS)
+    spared = tmp_path / "spared"
+    shutil.copytree(killed.store / "variants", spared / "s" / "variants")
+    code, _, err = forked_command("sweep", spared, *ARGUMENTS, "store=s", "threads=1")
     assert code == 0, err
     assert {cell.name: results(cell) for cell in killed.done()} == {
-        cell.name: results(cell) for cell in spared.done()
+        cell.name: results(cell) for cell in (spared / "s" / "cells").iterdir()
     }
     logs = [(cell / "log.txt").read_text() for cell in killed.done()]
     assert any("going on from the checkpoint" in log for log in logs)
