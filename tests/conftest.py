@@ -196,10 +196,8 @@ def forked_command() -> Iterator[Callable[..., tuple[int, str, str]]]:
 @pytest.fixture(scope="session")
 def smoke_variants(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder `variants` of a store, with the variant of `scene=motorcycle preset=smoke`."""
-    store, conf = (
-        Store(tmp_path_factory.mktemp("smoke")),
-        composed("scene=motorcycle", "preset=smoke"),
-    )
+    store = Store(tmp_path_factory.mktemp("smoke"))
+    conf = composed("scene=motorcycle", "preset=smoke")
     store.prepare()
     variant.build(conf.scene, conf.variant, store.variants, store.scenes)
     return store.variants
