@@ -82,23 +82,34 @@ def restore(conf: Conf, store: Store, variant_id: str) -> None:
 
 
 def how_to_get(scenes: Iterable[SceneConf]) -> str:
-    """Return the command that downloads published scenes which are missing; empty if none is."""
+    """Return how to get scenes of `conf/scene` whose photographs are missing; empty if none are."""
     from omegaconf import OmegaConf
 
-    missing: dict[tuple[str, Path], dict[str, None]] = {}
+    absent: dict[str, Path] = {}
+    for scene in scenes:
+        path = Path(scene.path or "")
+        if path.name == scene.name and not path.exists():
+            absent[scene.name] = path
+    missing: dict[tuple[str, Path], list[str]] = {}
     for file in sorted((CONF_DIR / "data").glob("*.yaml")):
         published = OmegaConf.load(file).scenes
-        for scene in scenes:
-            path = Path(scene.path or "")
-            if scene.name in published and path.name == scene.name and not path.exists():
-                missing.setdefault((file.stem, path.parent), {})[scene.name] = None
+        for name, path in absent.items():
+            if name in published:
+                missing.setdefault((file.stem, path.parent), []).append(name)
     usual = Path(OmegaConf.load(CONF_DIR / "config.yaml").data_root)
     commands = [
         f"xrgs-data download {dataset} {' '.join(names)}"
         + ("" if root == usual else f" --data-root {shlex.quote(str(root))}")
         for (dataset, root), names in missing.items()
     ]
-    return f"to download what is missing: {'; '.join(commands)}" if commands else ""
+    hints = [f"to download what is missing: {'; '.join(commands)}"] if commands else []
+    captures = {file.stem for file in (CONF_DIR / "scene/captures").glob("*.yaml")}
+    if own := [str(path) for name, path in absent.items() if name in captures]:
+        hints.append(
+            "no command downloads the captures: docs/study.md says where their photographs are from"
+            f" (section Scenes); they belong into {', '.join(own)}"
+        )
+    return "\n".join(hints)
 
 
 def find_or_build(conf: Conf, store: Store) -> str:
