@@ -56,7 +56,7 @@ def take_step(optimizer: SplatOptimizer, seed: int) -> dict[str, Tensor]:
 
 
 def moments(optimizer: SplatOptimizer, name: str) -> tuple[Tensor, Tensor]:
-    state = optimizer.adam.state[optimizer.gaussians[name]]
+    state = optimizer.adam[name]
     return state["exp_avg"], state["exp_avg_sq"]
 
 
@@ -97,20 +97,20 @@ def test_the_rate_of_means_decays_to_a_hundredth() -> None:
     optimizer = optimizer_of(steps=8)
     rates = []
     for seed in range(8):
-        rates.append(optimizer.adam.param_groups[0]["lr"])
+        rates.append(optimizer.rates["means"])
         take_step(optimizer, seed)
-    rates.append(optimizer.adam.param_groups[0]["lr"])
+    rates.append(optimizer.rates["means"])
     assert rates == pytest.approx([1.6e-4 * 2.0 * 0.01 ** (step / 8) for step in range(9)])
     assert rates[-1] == pytest.approx(1.6e-4 * 2.0 * 0.01)
-    others = {group["name"]: group["lr"] for group in optimizer.adam.param_groups[1:]}
-    assert others == pytest.approx({k: v for k, v in GSPLAT_RATES.items() if k != "means"})
+    optimizer.rates["means"] = GSPLAT_RATES["means"]
+    assert optimizer.rates == pytest.approx(GSPLAT_RATES)
 
 
 def test_the_decay_of_the_rate_of_means_may_wait() -> None:
     optimizer = optimizer_of(steps=20, settings=OptimizerSettings(means_decay_from=7500))
     rates = []
     for seed in range(21):
-        rates.append(optimizer.adam.param_groups[0]["lr"])
+        rates.append(optimizer.rates["means"])
         take_step(optimizer, seed)
     waiting = [3.2e-4] * 6  # after 0 to 5 steps, a quarter of the run
     assert rates == pytest.approx(waiting + [3.2e-4 * 0.01 ** (s / 15) for s in range(1, 16)])
@@ -125,8 +125,8 @@ def test_a_skipped_step_moves_nothing_and_the_rate_goes_on() -> None:
     take_step(other, 1)
     take_step(other, 2)
     assert skipping.steps_done == other.steps_done == 2
-    assert skipping.adam.param_groups[0]["lr"] == other.adam.param_groups[0]["lr"]
-    assert skipping.adam.state[skipping.gaussians.means]["step"] == 1  # of Adam's own steps
+    assert skipping.rates["means"] == other.rates["means"]
+    assert skipping.adam["means"]["step"] == 1  # of Adam's own steps
 
 
 def test_the_harmonics_move_at_every_third_step(backend: str) -> None:
@@ -201,7 +201,7 @@ def test_no_gaussians_left(backend: str) -> None:
     optimizer.keep(torch.zeros(5, dtype=torch.bool))
     take_step(optimizer, 2)
     assert len(optimizer.gaussians) == 0
-    assert optimizer.adam.state[optimizer.gaussians.means]["step"] == 2
+    assert optimizer.adam["means"]["step"] == 2
     optimizer.append(normal_parameters(2, 3))
     take_step(optimizer, 4)
     assert optimizer.gaussians.means.isfinite().all()

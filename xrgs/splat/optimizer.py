@@ -14,9 +14,11 @@ from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.splat.settings import NOMINAL_STEPS, OptimizerSettings
 
+_MOMENTS = ("exp_avg", "exp_avg_sq")
+
 
 class SplatOptimizer:
-    """One `torch.optim.Adam` with a named group for each parameter, at gsplat's learning rates.
+    """Adam with a learning rate for each parameter, gsplat's by default.
 
     The rates are from gsplat's `examples/simple_trainer.py`. The rate of `means` after t steps is
 
@@ -35,10 +37,16 @@ class SplatOptimizer:
     always fit. New Gaussians start with moments of zero and the step count of the others, as in
     gsplat (`strategy/ops.py`).
 
+    `torch.optim.Adam` gives the same, but the first one of a process imports torch's compiler, which
+    takes more than a second of a cell.
+
     Attributes:
-        adam: Holds groups and state: `adam.state[gaussians.means]["exp_avg"]`.
+        adam: Adam's state of each parameter by the names of torch: `step` [], `exp_avg` and
+            `exp_avg_sq` [N, ...]; empty before the parameter's first step.
         backend: `torch` or `native`: the backend that computes a step.
         gaussians: The optimized Gaussians.
+        rates: The present learning rate of each parameter.
+        settings: Learning rates at the start, and Adam's constants.
         steps_done: Number of training steps so far, with the steps that `skip_step` counted.
     """
 
@@ -76,22 +84,16 @@ class SplatOptimizer:
         if settings.shN_every < 1:
             raise ValueError(f"shN_every must be at least 1, got {settings.shN_every}")
         self.gaussians = gaussians
+        self.settings = settings
         self.means_rate = settings.means * scene_scale
-        self.means_final = settings.means_final
         self.means_decay_from = settings.means_decay_from * steps / NOMINAL_STEPS
-        self.shN_every = settings.shN_every
         self.steps = steps
         self.steps_done = 0
         self.backend = resolve_backend(backend)
-        rates = {name: getattr(settings, name) for name in PARAMETERS}
-        rates["means"] = self.means_rate
-        rates["shN"] *= self.shN_every
-        self.adam = torch.optim.Adam(
-            [{"name": name, "params": [gaussians[name]], "lr": rates[name]} for name in PARAMETERS],
-            betas=(settings.beta1, settings.beta2),
-            eps=settings.eps,
-            fused=True,  # a fifth of the default's time, and as exact
-        )
+        self.rates: dict[str, float] = {name: getattr(settings, name) for name in PARAMETERS}
+        self.rates["means"] = self.means_rate
+        self.rates["shN"] *= settings.shN_every
+        self.adam: dict[str, dict[str, Tensor]] = {name: {} for name in PARAMETERS}
 
     def step(self, camera: Camera | None = None, *, sh_degree: int = 0) -> None:
         """Move every parameter that has a gradient, then decay the rate of `means`.
@@ -106,14 +108,23 @@ class SplatOptimizer:
             sh_degree: Highest band of the spherical harmonics that was rendered.
         """
         implementation("optimizer", self.backend).step(
-            self.adam, camera if self.moves_harmonics else None, sh_degree
+            self, camera if self.moves_harmonics else None, sh_degree
         )
         self.skip_step()
+
+    def adam_of(self, name: str) -> tuple[Tensor, Tensor, Tensor]:
+        """Return exp_avg, exp_avg_sq and step of a parameter, zeros before its first step."""
+        state = self.adam[name]
+        if not state:
+            state["step"] = torch.zeros(())
+            for key in _MOMENTS:
+                state[key] = torch.zeros_like(self.gaussians[name], requires_grad=False)
+        return state["exp_avg"], state["exp_avg_sq"], state["step"]
 
     @property
     def moves_harmonics(self) -> bool:
         """Whether the next step moves shN."""
-        return self.steps_done % self.shN_every == 0
+        return self.steps_done % self.settings.shN_every == 0
 
     def skip_step(self) -> None:
         """Count a training step and decay the rate of `means`, but move nothing.
@@ -125,13 +136,8 @@ class SplatOptimizer:
 
     def _decay_means_rate(self) -> None:
         decaying = max(0, self.steps_done - self.means_decay_from)
-        decay: float = self.means_final ** (decaying / (self.steps - self.means_decay_from))
-        self._group("means")["lr"] = self.means_rate * decay
-
-    def rate(self, name: str) -> float:
-        """Return the present learning rate of the parameter `name`."""
-        rate: float = self._group(name)["lr"]
-        return rate
+        decay = self.settings.means_final ** (decaying / (self.steps - self.means_decay_from))
+        self.rates["means"] = self.means_rate * decay
 
     def zero_grad(self) -> None:
         """Drop the gradients of all parameters."""
@@ -140,7 +146,7 @@ class SplatOptimizer:
 
     def state_bytes(self) -> int:
         """Return the number of bytes of Adam's state."""
-        return sum(value.nbytes for state in self.adam.state.values() for value in state.values())
+        return sum(value.nbytes for state in self.adam.values() for value in state.values())
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state that `load_state_dict` continues from.
@@ -150,7 +156,7 @@ class SplatOptimizer:
             where it has none; `steps_done`.
         """
         values = {name: self.gaussians[name].detach() for name in PARAMETERS}
-        adam = {name: dict(self.adam.state.get(self.gaussians[name], {})) for name in PARAMETERS}
+        adam = {name: dict(self.adam[name]) for name in PARAMETERS}
         return {"gaussians": values, "adam": adam, "steps_done": self.steps_done}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -164,7 +170,7 @@ class SplatOptimizer:
         count = len(values["means"])
         for name in PARAMETERS:
             current = self.gaussians[name]
-            moments = [adam[name][key] for key in ("exp_avg", "exp_avg_sq") if adam[name]]
+            moments = [adam[name][key] for key in _MOMENTS if adam[name]]
             for value in (values[name], *moments):
                 if value.shape != (count, *current.shape[1:]) or value.dtype != current.dtype:
                     raise ValueError(
@@ -174,10 +180,8 @@ class SplatOptimizer:
             if adam[name] and adam[name]["step"].shape != ():
                 raise ValueError(f"{name}: Adam's step must be a scalar")
         for name in PARAMETERS:
-            self._replace(name, values[name], torch.zeros_like)
-            self.adam.state.pop(self.gaussians[name], None)
-            if adam[name]:
-                self.adam.state[self.gaussians[name]] = dict(adam[name])
+            self.gaussians[name] = values[name].detach().requires_grad_()
+            self.adam[name] = dict(adam[name])
         self.steps_done = int(state["steps_done"])
         self._decay_means_rate()
 
@@ -216,19 +220,11 @@ class SplatOptimizer:
     def forget(self, index: Tensor) -> None:
         """Give the Gaussians `index` [M] moments of zero in every parameter."""
         for name in PARAMETERS:
-            state = self.adam.state.get(self.gaussians[name], {})
-            for key in state.keys() & {"exp_avg", "exp_avg_sq"}:
-                state[key][index] = 0
+            for key in self.adam[name].keys() & _MOMENTS:
+                self.adam[name][key][index] = 0
 
     def _replace(self, name: str, value: Tensor, moment: Callable[[Tensor], Tensor]) -> None:
         """Replace a parameter by `value`, and each of its Adam moments m by `moment(m)`."""
-        state = self.adam.state.pop(self.gaussians[name], {})
-        leaf = value.detach().requires_grad_()
-        self.gaussians[name] = leaf
-        self._group(name)["params"] = [leaf]
-        if state:  # none before the first step
-            moments = {key: moment(state[key]) for key in ("exp_avg", "exp_avg_sq")}
-            self.adam.state[leaf] = state | moments
-
-    def _group(self, name: str) -> dict[str, Any]:
-        return self.adam.param_groups[PARAMETERS.index(name)]
+        self.gaussians[name] = value.detach().requires_grad_()
+        for key in self.adam[name].keys() & _MOMENTS:  # none before the first step
+            self.adam[name][key] = moment(self.adam[name][key])

@@ -37,16 +37,6 @@ def take_step(of: SplatOptimizer, gradients: dict[str, Tensor]) -> None:
     of.step()
 
 
-def rate_of(of: SplatOptimizer, name: str) -> float:
-    rate: float = of.adam.param_groups[PARAMETERS.index(name)]["lr"]
-    return rate
-
-
-def moment(of: SplatOptimizer, name: str, which: str) -> Tensor:
-    value: Tensor = of.adam.state[of.gaussians[name]][which]
-    return value
-
-
 def assert_same(ours: SplatOptimizer, theirs: SplatOptimizer, steps: int) -> None:
     """Equal but for rounding: an ulp a step of the moments, and of the distance gone.
 
@@ -55,15 +45,15 @@ def assert_same(ours: SplatOptimizer, theirs: SplatOptimizer, steps: int) -> Non
     """
     for name in PARAMETERS:
         for which, memory in (("exp_avg", 10), ("exp_avg_sq", 1000)):
-            a, b = moment(ours, name, which), moment(theirs, name, which)
+            a, b = ours.adam[name][which], theirs.adam[name][which]
             # Of a first moment, whose terms may cancel, relative to the root of the second.
-            scale = b if which == "exp_avg_sq" else moment(theirs, name, "exp_avg_sq").sqrt() * 32
+            scale = b if which == "exp_avg_sq" else theirs.adam[name]["exp_avg_sq"].sqrt() * 32
             assert ((a - b).abs() <= 2 * min(steps, memory) * ULP * scale).all(), (name, which)
         a, b = ours.gaussians[name].detach(), theirs.gaussians[name].detach()
-        rate = ours.means_rate if name == "means" else rate_of(ours, name)
+        rate = ours.means_rate if name == "means" else ours.rates[name]
         bound = steps * ULP * (b.abs() + 8 * rate)
         assert ((a - b).abs() <= bound).all(), name
-        assert ours.adam.state[ours.gaussians[name]]["step"] == steps
+        assert ours.adam[name]["step"] == steps
 
 
 @pytest.mark.parametrize("count", [1, 5, 16, 37, 400])
@@ -164,7 +154,7 @@ def test_what_has_no_gradient_yet_stays_to_the_bit(isa: str) -> None:
     take_step(of, gradients)
     assert torch.equal(of.gaussians.shN[:, 3:], before[:, 3:])
     assert (of.gaussians.shN[:, :3] != before[:, :3]).all()
-    assert (moment(of, "shN", "exp_avg")[:, 3:] == 0).all()
+    assert (of.adam["shN"]["exp_avg"][:, 3:] == 0).all()
     # What had one goes on by its momentum.
     after = of.gaussians.shN.detach().clone()
     take_step(of, {name: torch.zeros_like(g) for name, g in gradients.items()})
@@ -179,7 +169,7 @@ def test_a_parameter_without_gradient_is_left_alone() -> None:
     del gradients["sh0"]
     take_step(of, gradients)
     assert torch.equal(of.gaussians.sh0, before)
-    assert of.gaussians.sh0 not in of.adam.state
+    assert not of.adam["sh0"]
 
 
 def test_torch_goes_on_from_our_state_and_we_from_its() -> None:
@@ -236,7 +226,7 @@ def test_harmonics_move_by_the_gradient_that_sh0_implies(isa: str, count: int, d
         take_step_of_a_view(each, gradients, degree)
     on = (degree + 1) ** 2 - 1
     for which, power in (("exp_avg", 1), ("exp_avg_sq", 2)):
-        a, b = moment(ours, "shN", which), moment(theirs, "shN", which)
+        a, b = ours.adam["shN"][which], theirs.adam["shN"][which]
         # A basis function is a small sum of products: some roundings of its largest term, below 3.
         scale = (gradients["sh0"].abs() * 12) ** power * (1 - (0.9, 0.999)[power - 1])
         assert ((a - b).abs() <= 16 * ULP * scale).all()
@@ -245,7 +235,7 @@ def test_harmonics_move_by_the_gradient_that_sh0_implies(isa: str, count: int, d
     assert torch.equal(ours.gaussians.shN[:, on:], before[:, on:])
     assert (ours.gaussians.shN[:, :on] != before[:, :on]).all()
     assert ours.gaussians.shN.grad is None
-    assert ours.adam.state[ours.gaussians.shN]["step"] == 1
+    assert ours.adam["shN"]["step"] == 1
     for name in PARAMETERS[:-1]:  # as without the view
         alone = optimizer(count, "native")
         take_step(alone, {name: gradients[name] for name in PARAMETERS[:-1]})
@@ -270,7 +260,7 @@ def test_threads_change_no_bit(isa: str, of_a_view: bool) -> None:
         for name in PARAMETERS:
             assert torch.equal(other.gaussians[name], results[0].gaussians[name])
             for which in MOMENTS:
-                assert torch.equal(moment(other, name, which), moment(results[0], name, which))
+                assert torch.equal(other.adam[name][which], results[0].adam[name][which])
 
 
 def test_harmonics_need_the_bands_that_are_on() -> None:

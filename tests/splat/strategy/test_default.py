@@ -75,7 +75,7 @@ def assert_same(ours: Ours, theirs: Theirs) -> None:
         # difference of logarithms: last digits.
         tolerance = {"means": 1e-5, "scales": 1e-6}.get(name, 0)
         torch.testing.assert_close(mine, reference, rtol=tolerance, atol=tolerance)
-        mine_state = ours.optimizer.adam.state[ours.gaussians[name]]
+        mine_state = ours.optimizer.adam[name]
         their_state = theirs.optimizers[name].state[theirs.params[name]]
         assert mine_state.keys() == their_state.keys()
         for key, value in their_state.items():

@@ -180,12 +180,12 @@ def test_removing_keeps_moments_and_statistics_in_step() -> None:
     values = uniform(3)
     strategy = strategy_of(values)
     take_step(strategy, {name: value + 1 for name, value in values.items()})
-    moments = strategy.optimizer.adam.state[strategy.gaussians.means]["exp_avg"].clone()
+    moments = strategy.optimizer.adam["means"]["exp_avg"].clone()
     densify(strategy, 1, View(torch.eye(3)[:, :2], torch.tensor([True, True, False])))
     sums, counts = strategy.grad2d_sum.clone(), strategy.visible_count.clone()
     assert strategy.remove(torch.tensor([False, True, False])) == 1
     kept = torch.tensor([0, 2])
-    state = strategy.optimizer.adam.state[strategy.gaussians.means]
+    state = strategy.optimizer.adam["means"]
     assert torch.equal(state["exp_avg"], moments[kept])
     assert torch.equal(strategy.grad2d_sum, sums[:, kept])
     assert torch.equal(strategy.visible_count, counts[:, kept])

@@ -1,4 +1,4 @@
-"""Adam's step by the compiled kernel, on the state that `torch.optim.Adam` keeps."""
+"""Adam's step by the compiled kernel."""
 
 from __future__ import annotations
 
@@ -8,13 +8,15 @@ import torch
 from torch import Tensor
 
 from xrgs import _native
+from xrgs.splat.gaussians import PARAMETERS
 from xrgs.splat.native.arguments import handle
 
 if TYPE_CHECKING:
     from xrgs.splat.cameras import Camera
+    from xrgs.splat.optimizer import SplatOptimizer
 
 
-def step(adam: torch.optim.Adam, camera: Camera | None = None, sh_degree: int = 0) -> None:
+def step(optimizer: SplatOptimizer, camera: Camera | None = None, sh_degree: int = 0) -> None:
     """Move every parameter that has a gradient, in one pass over memory.
 
     The formula is torch's, in torch's order, with one rounding fewer where a multiplication and an
@@ -26,9 +28,8 @@ def step(adam: torch.optim.Adam, camera: Camera | None = None, sh_degree: int = 
     written to memory.
 
     Args:
-        adam: Named groups of one parameter each, float32 [N, ...] on the CPU, contiguous, with
-            betas and eps in common and without weight decay. Parameters without a gradient stay as
-            they are.
+        optimizer: The parameters with their gradients, and Adam's state of them, which is updated:
+            float32 on the CPU, contiguous. Parameters without a gradient stay as they are.
         camera: The view that the gradients come from; None leaves shN as it is, unless it has a
             gradient (`SplatOptimizer.step`).
         sh_degree: Highest band of the spherical harmonics that was rendered.
@@ -36,57 +37,43 @@ def step(adam: torch.optim.Adam, camera: Camera | None = None, sh_degree: int = 
     Raises:
         ValueError: A parameter, gradient or moment is not float32 on the CPU and contiguous.
     """
-    groups = {group["name"]: group for group in adam.param_groups}
     harmonics: tuple[Any, ...] | None = None
     moved: list[Tensor] = []
-    if camera is not None and groups["sh0"]["params"][0].grad is not None:
-        harmonics = _harmonics(adam, groups, camera, sh_degree)
-        moved.append(groups["shN"]["params"][0])
+    if camera is not None and (gradient := optimizer.gaussians.sh0.grad) is not None:
+        harmonics = _harmonics(optimizer, gradient, camera, sh_degree)
+        moved.append(optimizer.gaussians.shN)
     entries = []
-    for name, group in groups.items():
-        (parameter,) = group["params"]
+    for name in PARAMETERS:
+        parameter = optimizer.gaussians[name]
         if parameter.grad is None:
             continue
-        state = _adam_state(adam, parameter)
-        changing = (parameter, state["exp_avg"], state["exp_avg_sq"])
-        values, exp_avg, exp_avg_sq = (_plain_handle(name, tensor) for tensor in changing)
-        gradient = _plain_handle(name, parameter.grad)
-        number = state["step"].add_(1).item()
-        entries.append((values, gradient, exp_avg, exp_avg_sq, group["lr"], number))
+        exp_avg, exp_avg_sq, number = optimizer.adam_of(name)
+        tensors = (parameter, parameter.grad, exp_avg, exp_avg_sq)
+        handles = (_plain_handle(name, tensor) for tensor in tensors)
+        entries.append((*handles, optimizer.rates[name], number.add_(1).item()))
         moved.append(parameter)
-    beta1, beta2 = adam.defaults["betas"]
-    threads = torch.get_num_threads()
-    _native.adam_step(entries, beta1, beta2, adam.defaults["eps"], threads, harmonics)
+    settings, threads = optimizer.settings, torch.get_num_threads()
+    _native.adam_step(entries, settings.beta1, settings.beta2, settings.eps, threads, harmonics)
     # So that a backward pass refuses to use the values from before.
     for tensor in moved:
         torch.autograd.graph.increment_version(tensor)
 
 
 def _harmonics(
-    adam: torch.optim.Adam, groups: dict[str, dict[str, Any]], camera: Camera, sh_degree: int
+    optimizer: SplatOptimizer, gradient: Tensor, camera: Camera, sh_degree: int
 ) -> tuple[Any, ...]:
-    """Return the argument that moves shN by the gradient that sh0's implies."""
-    means, sh0, shN = (groups[name]["params"][0] for name in ("means", "sh0", "shN"))
-    state = _adam_state(adam, shN)
+    """Return the argument that moves shN by what the gradient of sh0 implies."""
+    gaussians = optimizer.gaussians
+    exp_avg, exp_avg_sq, number = optimizer.adam_of("shN")
     return (
-        *(_plain_handle("shN", x) for x in (shN, state["exp_avg"], state["exp_avg_sq"])),
-        _plain_handle("means", means),
-        _plain_handle("sh0", sh0.grad),
+        *(_plain_handle("shN", x) for x in (gaussians.shN, exp_avg, exp_avg_sq)),
+        _plain_handle("means", gaussians.means),
+        _plain_handle("sh0", gradient),
         camera.numbers.position,
         sh_degree,
-        groups["shN"]["lr"],
-        state["step"].add_(1).item(),
+        optimizer.rates["shN"],
+        number.add_(1).item(),
     )
-
-
-def _adam_state(adam: torch.optim.Adam, parameter: Tensor) -> dict[str, Tensor]:
-    """Return Adam's state of a parameter, created as torch creates it if there is none."""
-    state: dict[str, Tensor] = adam.state[parameter]
-    if not state:
-        state["step"] = torch.zeros(())
-        state["exp_avg"] = torch.zeros_like(parameter, memory_format=torch.preserve_format)
-        state["exp_avg_sq"] = torch.zeros_like(parameter, memory_format=torch.preserve_format)
-    return state
 
 
 def _plain_handle(name: str, value: Tensor) -> Any:

@@ -169,7 +169,7 @@ class MCMCStrategy(Strategy):
 
     def _move_means(self) -> None:
         """Add the noise of a step to the means."""
-        size = self.settings.noise * self.optimizer.rate("means")
+        size = self.settings.noise * self.optimizer.rates["means"]
         if not size:
             return
         gaussians, activations = self.gaussians, self._activations
