@@ -37,8 +37,8 @@ class SplatOptimizer:
     always fit. New Gaussians start with moments of zero and the step count of the others, as in
     gsplat (`strategy/ops.py`).
 
-    `torch.optim.Adam` gives the same, but the first one of a process imports torch's compiler, which
-    takes more than a second of a cell.
+    `torch.optim.Adam` gives the same, but the first one of a process imports torch's compiler,
+    which takes more than a second of a cell.
 
     Attributes:
         adam: Adam's state of each parameter by the names of torch: `step` [], `exp_avg` and
