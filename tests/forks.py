@@ -30,7 +30,7 @@ WORKER = "xrgs.sweep.jobs.worker"
 #: What the commands and the children of a sweep import, some of it late.
 MODULES = (
     *(f"xrgs.cli.{name}" for name in ("bench", "render", "report", "status", "store", "sweep")),
-    *("kornia.losses", "matplotlib.backends.backend_agg", "torch._dynamo"),
+    *("kornia.losses", "matplotlib.backends.backend_agg"),
     *("xrgs.bench.run", "xrgs.experiment.cell", "xrgs.report", "xrgs.sweep.rerun"),
     *("xrgs.viewer.film", "xrgs.viewer.trained"),
 )
