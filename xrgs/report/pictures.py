@@ -56,7 +56,7 @@ _CURVES = {"gaussians": "Gaussians", "loss": "loss of the step's view, as each r
 #: The most pixels of an image: three are in memory at a time, with 12 bytes a pixel, and are drawn.
 _MAX_PIXELS = 1 << 24
 #: The most pictures that are drawn without being asked for by name; each takes up to a second.
-_MAX_PICTURES = 100
+_MAX_PICTURES = 40
 #: The fewest values of a setting that show how a change depends on it.
 _MIN_SETTINGS = 3
 #: The largest value of a setting that an axis can show: the space beside it needs more of float64.
@@ -96,7 +96,7 @@ def draw(
         quality: The table that `xrgs.report.curves.joined` returns.
         folder: The existing folder to write the files to.
         names: File names without suffix of the pictures to draw; None draws all, but no more than
-            the first 100.
+            the first 40.
 
     Returns:
         The pictures, in the order of the tables.
