@@ -72,8 +72,8 @@ def blur_notes(blur: float | None) -> list[str]:
         return []
     return [
         f"LR photographs are blurrier than their pixels: by a Gaussian of {blur:.2f} px, where a"
-        " pixel's area has 0.29. components.supersampled takes them to be sharper;"
-        " +ablation=formation learns the blur"
+        " pixel's area has 0.29. plus, lean and +ablation=formation learn the blur;"
+        " components.supersampled alone takes them to be sharper"
     ]
 
 
