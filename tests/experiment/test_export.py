@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
+import pytest
+import torch
 from PIL import Image
 
+import xrgs
 from xrgs.capture import images
 from xrgs.capture.frozen import freeze
 from xrgs.capture.views import Variant, View
-from xrgs.experiment.export import export
+from xrgs.experiment.export import export, without_invisible
+from xrgs.splat.gaussians import Gaussians
 
 
 def masked_variant(folder: Path) -> Variant:
@@ -71,3 +76,34 @@ def test_without_masks_none_is_written(tmp_path: Path) -> None:
     export(frozen.folder, "nerfstudio", tmp_path / "out")
     assert not (tmp_path / "out" / "masks").exists()
     assert "mask_path" not in (tmp_path / "out" / "transforms.json").read_text()
+
+
+@pytest.mark.parametrize("mode", ["classic", "antialiased"])
+def test_gaussians_that_no_render_shows_are_left_out(
+    mode: Literal["classic", "antialiased"],
+) -> None:
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(300, 3, generator=generator) * 2 + torch.tensor([-1.0, -1.0, 2.0])
+    gaussians = Gaussians.from_points(points, torch.rand(300, 3, generator=generator))
+    opacities = torch.logspace(-4, -0.1, 300)
+    gaussians["opacities"] = opacities.logit()
+    shown = without_invisible(gaussians, 1 / 255)
+    assert len(shown) == (opacities >= 1 / 255).sum()
+    K = torch.tensor([[40.0, 0, 20], [0, 40, 15], [0, 0, 1]])
+    before, after = (
+        xrgs.rasterization(
+            some.means,
+            some.quats,
+            some.scales.exp(),
+            some.opacities.sigmoid(),
+            torch.cat([some.sh0, some.shN], 1),
+            torch.eye(4)[None],
+            K[None],
+            40,
+            30,
+            sh_degree=3,
+            rasterize_mode=mode,
+        )[0]
+        for some in (gaussians, shown)
+    )
+    torch.testing.assert_close(before, after, rtol=0, atol=1e-6)  # sums have another order

@@ -2,7 +2,7 @@
 
 Cameras, points and splats are in the normalised world of training. `transform.json` has the
 similarity from the world of SfM to that world. Images are undistorted, and each has its own pinhole
-camera.
+camera. Gaussians of a cell that no render shows are left out.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from xrgs.capture.colmap import PinholeImage
     from xrgs.capture.dataset import Dataset, LoadedView
     from xrgs.capture.views import Variant
+    from xrgs.splat.gaussians import Gaussians
 
 _SPLATS = "splats.ply"
 #: Formats of one file with the Gaussians alone; it is named so.
@@ -69,7 +70,7 @@ def export(path: Path, layout: str, out: Path) -> str:
         if cell is not None:
             # Not a copy: cells of older versions have no tag of antialiased Gaussians.
             antialiased = cell.config().splat.raster.antialiased
-            save_ply(out / _SPLATS, cell.gaussians(), antialiased=antialiased)
+            save_ply(out / _SPLATS, _shown(cell), antialiased=antialiased)
     except OSError as error:
         raise XrgsError(f"out={out}: {error.filename}: {error.strerror}") from error
     splats = "" if cell is None else f", {_SPLATS}"
@@ -89,7 +90,7 @@ def export_splats(path: Path, form: str, out: Path) -> str:
         out: The new file.
 
     Returns:
-        A line with the number of Gaussians that were written.
+        A line with the number of Gaussians that were written, and of those that the cell has.
 
     Raises:
         XrgsError: The cell or the file can't be read, or `out` exists, ends otherwise or can't be
@@ -101,14 +102,15 @@ def export_splats(path: Path, form: str, out: Path) -> str:
         raise XrgsError(f"out={out}: the name of a {form} file must end with .{form}")
     if out.exists():
         raise XrgsError(f"out={out}: it exists; name a new file")
-    up = {}
+    up, total = {}, 0
     if path.suffix and not path.is_dir():
         gaussians, antialiased = load_gaussians(path)
     else:
         cell = _cell(path)
         if cell is None:
             raise XrgsError(f"{path}: a variant has no Gaussians; give a cell, or another format")
-        gaussians, antialiased = cell.gaussians(), cell.config().splat.raster.antialiased
+        gaussians, antialiased = _shown(cell), cell.config().splat.raster.antialiased
+        total = cell.summary().gaussians
         viewmats = np.stack([view.camera.viewmat.numpy() for view in cell.dataset().train])
         up = {"up": -viewmats[:, 1, :3].mean(axis=0)}  # y of a camera points down
     try:
@@ -116,7 +118,31 @@ def export_splats(path: Path, form: str, out: Path) -> str:
     except OSError as error:
         raise XrgsError(f"out={out}: {error.strerror}") from error
     kind = "antialiased Gaussians" if antialiased else "Gaussians"
-    return f"{len(gaussians)} {kind}: written to {out}"
+    of = f" of {total}, without those that no render shows" if total > len(gaussians) else ""
+    return f"{len(gaussians)} {kind}{of}: written to {out}"
+
+
+def without_invisible(gaussians: Gaussians, alpha_min: float) -> Gaussians:
+    """Leave out the Gaussians that no render shows, because their opacity is below `alpha_min`.
+
+    Such Gaussians are left where they faded after densification, when none is removed any more.
+
+    Args:
+        gaussians: N Gaussians.
+        alpha_min: The renderer skips contributions below it (`splat.raster.alpha_min`).
+
+    Returns:
+        New Gaussians, without gradients. Their renders are the same but for rounding.
+    """
+    from xrgs.splat.gaussians import Gaussians
+
+    # A thousandth less: the logistic functions of two renderers round differently.
+    kept = gaussians.opacities.detach().sigmoid() >= 0.999 * alpha_min
+    return Gaussians(*(parameter.detach()[kept] for parameter in gaussians.raw()))
+
+
+def _shown(cell: CellFolder) -> Gaussians:
+    return without_invisible(cell.gaussians(), cell.config().splat.raster.alpha_min)
 
 
 def transform(variant: Variant) -> NDArray[np.float64]:
