@@ -125,7 +125,7 @@ def export_splats(path: Path, form: str, out: Path) -> str:
 def without_invisible(gaussians: Gaussians, alpha_min: float) -> Gaussians:
     """Leave out the Gaussians that no render shows, because their opacity is below `alpha_min`.
 
-    Such Gaussians are left where they faded after densification, when none is removed any more.
+    A training leaves them behind where Gaussians fade after its last removal.
 
     Args:
         gaussians: N Gaussians.
