@@ -1,14 +1,14 @@
-"""Train the photographs of a cell with gsplat itself, on a GPU, and score its renders as xrgs does.
+"""Train the photographs of a cell with gsplat itself, on a GPU.
 
     python examples/train_with_gsplat.py save CELL scene --store xrgs-store
-    python examples/train_with_gsplat.py train scene renders --seed 0
-    python examples/train_with_gsplat.py score CELL renders --store xrgs-store
+    python examples/train_with_gsplat.py train scene renders/fern --seed 0
+    xrgs-report --external gsplat:renders
 
-The three steps may run on three machines. `save` writes the photographs, the cameras and the SfM
+The steps may run on different machines. `save` writes the photographs, the cameras and the SfM
 points of a cell. `train` needs torch, numpy, Pillow and gsplat 1.5.3 alone, and a GPU. It follows
 gsplat's `examples/simple_trainer.py` with its default settings: same initialisation, learning
 rates, loss and order of operations, and gsplat's own `rasterization` and `DefaultStrategy`. It
-writes a render of each test view. `score` compares them with the photographs by xrgs's metrics.
+writes a render of each test view, which a report scores beside the cells of its sweep.
 """
 
 from __future__ import annotations
@@ -43,11 +43,10 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     commands = parser.add_subparsers(dest="command", required=True)
-    save_, train_, score_ = (commands.add_parser(name) for name in ("save", "train", "score"))
-    for command, folder in ((save_, "scene"), (score_, "renders")):
-        command.add_argument("cell", help="the id of a trained cell, or the beginning of one")
-        command.add_argument(folder, type=Path)
-        command.add_argument("--store", default="xrgs-store", help="default: %(default)s")
+    save_, train_ = (commands.add_parser(name) for name in ("save", "train"))
+    save_.add_argument("cell", help="the id of a trained cell, or the beginning of one")
+    save_.add_argument("scene", type=Path, help="the folder to write")
+    save_.add_argument("--store", default="xrgs-store", help="default: %(default)s")
     train_.add_argument("scene", type=Path, help="the folder that `save` wrote")
     train_.add_argument("renders", type=Path, help="the folder to write")
     train_.add_argument("--seed", type=int, default=0, help="default: %(default)s")
@@ -227,31 +226,10 @@ def write_renders(splats: torch.nn.ParameterDict, views: Sequence[View], folder:
         Image.fromarray(pixels.cpu().numpy()).save(folder / f"{view.name}.png")
 
 
-def score(options: argparse.Namespace) -> None:
-    """Print the scores of each test view, their mean, and those of the cell."""
-    import pandas as pd
-
-    import xrgs
-    from xrgs.evaluation.metrics import score_view
-    from xrgs.evaluation.protocol import mean_scores
-
-    cell = xrgs.Store(options.store).find_cell(options.cell)
-    test, rows = cell.dataset().test, {}
-    for view in test:
-        pixels = np.array(Image.open(options.renders / f"{view.name}.png"))
-        rows[view.name] = score_view(torch.from_numpy(pixels) / 255, view.image, None, masked=False)
-    table = pd.DataFrame.from_dict(rows, orient="index", dtype=float)
-    table.loc["mean"] = table.mean()
-    table.loc["cell"] = mean_scores(cell.gaussians(), test, cell.config().splat)
-    print((options.renders / "training.json").read_text(), end="")
-    print(f"the cell has {len(cell.gaussians()):,} Gaussians")
-    print(table[["psnr", "ssim", "lpips"]].to_string(float_format="{:.4f}".format))
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run one of the three steps."""
+    """Run one of the two steps."""
     options = parse(arguments)
-    {"save": save, "train": train, "score": score}[options.command](options)
+    {"save": save, "train": train}[options.command](options)
 
 
 if __name__ == "__main__":
