@@ -236,7 +236,10 @@ def test_a_cell_of_another_identity_is_left_out(foreign: Store, mine: Store) -> 
     (cell.path / "identity.json").write_text(text.replace('"seed": 0', '"seed": 1'))
     seal(cell)
     (line,) = import_store(foreign.path, mine).left_out
-    assert line == f"cells/{cell.id}: identity.json: its digest is not the id of the cell"
+    why = (
+        "its digest is not the id of the cell: the file has changed, or the cell is of version 0.1"
+    )
+    assert line.startswith(f"cells/{cell.id}: identity.json: {why}")
 
 
 def test_a_component_that_a_config_names_is_not_imported(
@@ -370,7 +373,8 @@ def test_links_and_devices_are_left_out(mine: Store, tmp_path: Path, kind: bytes
         header.type, header.linkname = kind, "/etc/passwd"
         members.append((header, b""))
     found = import_store(archive_of(tmp_path, *members), mine)
-    assert len(found.left_out) == 3
+    named = [name for line in found.left_out for name in line.partition(": ")[0].split(", ")]
+    assert len(named) == 3
     assert all("not a regular file" in line for line in found.left_out)
     assert contents(mine) == {}
 
@@ -391,16 +395,18 @@ def test_the_number_of_files_their_bytes_and_lines_are_bounded(
     mine: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     source = archive_of(tmp_path, *((f"x{number}", b"1" * 100) for number in range(50)))
-    monkeypatch.setattr(archive, "_MAX_LINES", 10)
-    lines = import_store(source, mine).left_out
-    assert lines[10:] == ("and 40 more",)
+    why = "no store has a file of this name"
+    assert import_store(source, mine).left_out == (f"x0, x1, x2 and 47 more: {why}",)
     for bound, value in (("_MAX_FILES", 20), ("_MAX_IMPORT_BYTES", 2000)):
         with monkeypatch.context() as patch:
-            patch.setattr(archive, "_MAX_LINES", 1000)
             patch.setattr(archive, bound, value)
             lines = import_store(source, mine).left_out
-        assert len(lines) == 21
+        assert lines[0] == f"x0, x1, x2 and 17 more: {why}"
+        assert len(lines) == 2
         assert "the rest was not read" in lines[-1]
+    monkeypatch.setattr(archive, "_MAX_LINES", 1)
+    monkeypatch.setattr(archive, "_MAX_FILES", 20)
+    assert import_store(source, mine).left_out[1:] == ("and 1 more reasons",)
 
 
 def test_a_header_that_would_fill_the_memory_is_not_read(mine: Store, tmp_path: Path) -> None:

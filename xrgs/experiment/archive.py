@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import itertools
 import json
 import math
 import os
@@ -203,8 +204,8 @@ def _relative_argument(word: str, here: Path) -> str:
 
 #: The most files and bytes that an archive or a folder may have.
 _MAX_FILES, _MAX_IMPORT_BYTES = 1_000_000, 1 << 40
-#: The most lines about what was left out.
-_MAX_LINES = 1000
+#: The most lines about what was left out, and the most names in one of them.
+_MAX_LINES, _MAX_NAMES = 1000, 3
 #: The largest header of a tar member, in bytes. tarfile reads such a header whole.
 _MAX_HEADER_BYTES = 1 << 20
 _CHUNK = 1 << 20
@@ -249,7 +250,7 @@ class Imported:
     present: int
     """How many cells, variants, scenes and records the store had already: they did not change."""
     left_out: tuple[str, ...]
-    """A line for each thing that was left out, with the reason."""
+    """A line for each reason why something was left out, with the names of the first items."""
 
     def __str__(self) -> str:
         counts = _counts(self.cells, self.variants, self.sweeps, self.scenes)
@@ -306,7 +307,8 @@ class _Border:
     """
 
     store: Store
-    left_out: list[str] = field(default_factory=list)
+    left_out: dict[str, list[str]] = field(default_factory=dict)
+    """The names of what is not imported, by the reason."""
     received: dict[str, set[str]] = field(default_factory=dict)
     """The files of each item, as file systems see them that ignore case."""
     refused: dict[str, str] = field(default_factory=dict)
@@ -329,8 +331,8 @@ class _Border:
             remove_path(home / _STAGING)
 
     def leave_out(self, name: str, why: str) -> None:
-        """Add a line about something that is not imported."""
-        self.left_out.append(for_line(f"{name}: {why}", 500))
+        """Remember something that is not imported, and why."""
+        self.left_out.setdefault(why, []).append(name)
 
     # Receiving
 
@@ -433,9 +435,16 @@ class _Border:
                 count[kind] += 1
             else:
                 self.present.add(item)
-        rest = len(self.left_out) - _MAX_LINES
-        lines = [*self.left_out[:_MAX_LINES], *([f"and {rest} more"] if rest > 0 else [])]
-        return Imported(**count, present=len(self.present), left_out=tuple(lines))
+        return Imported(**count, present=len(self.present), left_out=tuple(self._lines()))
+
+    def _lines(self) -> Iterator[str]:
+        """Yield a line for each reason, with the first names that it is of."""
+        for why, names in itertools.islice(self.left_out.items(), _MAX_LINES):
+            rest = len(names) - _MAX_NAMES
+            more = f" and {rest} more" if rest > 0 else ""
+            yield for_line(f"{', '.join(names[:_MAX_NAMES])}{more}: {why}", 500)
+        if (rest := len(self.left_out) - _MAX_LINES) > 0:
+            yield f"and {rest} more reasons"
 
     def _name(self, item: str) -> bool:
         """Give an item its name; return False where another process did so meanwhile."""
@@ -538,7 +547,10 @@ def _check_cell(folder: Path) -> None:
     if state.name != "done":
         raise StoreError(state.reason)
     if cell_id(cell.identity()) != cell.id:
-        raise StoreError("identity.json: its digest is not the id of the cell")
+        raise StoreError(
+            "identity.json: its digest is not the id of the cell: the file has changed, or the cell"
+            " is of version 0.1.0, whose archives are unpacked instead (tar xJf FILE)"
+        )
     if cell.config().seed != cell.identity().seed:
         raise StoreError("config.json: seed: not the seed of identity.json")
     for name in {"history.csv", "quality.csv"} & status.files.keys():
