@@ -134,6 +134,19 @@ def test_values_that_depend_on_the_seed_follow_it_in_one_composed_config(
     assert [(row.variant_seed, row.seed, row.condition) for row in rows] == [(3, 3, ""), (4, 4, "")]
 
 
+def test_cells_that_differ_in_numbers_share_one_config_and_get_their_own_values(
+    study: Callable[..., Study], compose: Callable[..., config.Conf]
+) -> None:
+    made = study()
+    axes = ["seed=0,1", "variant.factor=2,5", "variant.hr_fraction=0.1,0.5"]
+    plan = made._plan([*axes, "+ablation=consistency"])
+    assert len(plan) == 16
+    assert [cell.conf for cell in plan] == [compose(*cell.spec.overrides) for cell in plan]
+    assert len(made._context.config_loader.composed) == 2  # type: ignore[attr-defined]
+    with pytest.raises(XrgsError, match=r"^variant.factor=0: "):
+        made._plan(["variant.factor=2,0"])
+
+
 @pytest.mark.parametrize(
     ("fixed", "conditions"),
     [

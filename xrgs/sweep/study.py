@@ -9,6 +9,7 @@ training is left to that sweep; when nothing else is left to do, this sweep wait
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 import time
@@ -18,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hydra.errors import CompactHydraException
+from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from xrgs.capture import scenes
@@ -64,7 +66,8 @@ if TYPE_CHECKING:
 
     from xrgs.config import Conf
 
-_SEED = re.compile(r"seed=(\d+)")
+#: An override that sets a key to a number.
+_NUMBER = re.compile(r"([\w.]+)=((?:0|[1-9]\d*)(?:\.\d+)?)")
 #: Seconds between two looks at the cells of other sweeps.
 _POLL_S = 2.0
 #: Number of looks at cells with a file that can't be read now, before they are left alone.
@@ -85,7 +88,7 @@ class Study:
         self._context = context
         self._task = task
         self._config = config
-        self._composed: dict[tuple[bool, tuple[str, ...]], DictConfig] = {}
+        self._composed: dict[tuple[str, ...], DictConfig] = {}
         self._confs: dict[tuple[str, ...], Conf] = {}
         self._store: Store | None = None
         """The store, once it is prepared."""
@@ -275,16 +278,19 @@ class Study:
         return self._confs[overrides]
 
     def _hydra_config(self, overrides: tuple[str, ...]) -> DictConfig:
-        """Return Hydra's config. Seeds share one, because composing takes 0.1 s."""
-        seeds = [int(seed[1]) for text in overrides if (seed := _SEED.fullmatch(text))]
-        others = tuple(text for text in overrides if not _SEED.fullmatch(text))
-        composed = self._composed.get((bool(seeds), others))
-        if composed is None:
-            composed = self._context.config_loader.load_sweep_config(self._config, [*overrides])
-            launch.check(self._config, composed)
-            self._composed[bool(seeds), others] = composed
-        elif seeds:
-            composed.seed = seeds[-1]  # keys that are set to ${seed} follow it
+        """Return Hydra's config; those that differ in numbers alone share one composition.
+
+        Composing takes 0.1 s.
+        """
+        numbers = {text: match for text in overrides if (match := _NUMBER.fullmatch(text))}
+        alike = tuple(numbers[text][1] if text in numbers else text for text in overrides)
+        if alike not in self._composed:
+            loader = self._context.config_loader
+            self._composed[alike] = loader.load_sweep_config(self._config, [*overrides])
+        composed = self._composed[alike]
+        for match in numbers.values():
+            OmegaConf.update(composed, match[1], json.loads(match[2]))  # ${seed} follows seed
+        launch.check(self._config, composed)
         return composed
 
     def _with_variants(
