@@ -328,6 +328,29 @@ def test_of_heic_and_jpeg_of_one_name_one_is_taken(
     assert "IMG_0.HEIC (of IMG_0.jpg)" in found.notes[0]
 
 
+@pytest.mark.data
+def test_neighbouring_views_of_two_cameras_and_of_a_burst_stay(
+    data_root: Path, tmp_path: Path
+) -> None:
+    """trex has neighbouring views with a correlation of 0.997 on thumbnails of 16 px."""
+    photographs = sorted((data_root / "llff" / "trex" / "images").iterdir())[:12]
+    for number, (left, right) in enumerate(zip(photographs[::2], photographs[1::2], strict=True)):
+        for file, name, side in (
+            (left, f"rig/camera/IMG_{number}.jpg", 1002),
+            (right, f"rig/phone/IMG_{number}.jpg", 334),
+            (left, f"burst/{number}.jpg", 501),
+            (right, f"burst/{number}_1.jpg", 501),
+            (left, f"web/img_{number}.jpg", 334),
+        ):
+            (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+            with Image.open(file) as image:
+                image.resize((side, 3 * side // 4)).save(tmp_path / name, quality=60)
+    for part in ("rig", "burst"):
+        assert len(below(tmp_path / part).files) == 12
+    (tmp_path / "web").rename(tmp_path / "rig" / "web")
+    assert len(below(tmp_path / "rig").files) == 12
+
+
 def test_raw_files_and_films_of_the_photographs_names_are_said_once(tmp_path: Path) -> None:
     shoot(tmp_path)
     for name in ("IMG_0.DNG", "IMG_1.MOV", "IMG_2.ARW"):
