@@ -1,4 +1,4 @@
-"""Frames of videos: which are taken, how they are turned, and what is refused."""
+"""Frames of videos: which are taken, how they are shown, and what is refused."""
 
 from __future__ import annotations
 
@@ -22,6 +22,14 @@ WIDTH, HEIGHT = 96, 64
 #: A fixed-point rotation by a quarter turn, as a phone writes it into the header of a track.
 UPRIGHT = b"\0\1\0\0" + bytes(12) + b"\0\1\0\0" + bytes(12) + b"@\0\0\0"
 QUARTER_TURN = bytes(4) + b"\0\1\0\0" + bytes(4) + b"\xff\xff\0\0" + bytes(16) + b"@\0\0\0"
+#: Colours in sRGB that Display P3 and BT.2020 have too.
+PATCHES = [(230, 30, 30), (30, 220, 40), (30, 60, 220), (200,) * 3, (240, 200, 30), (9, 20, 40)]
+#: From linear sRGB to linear RGB of these primaries, by ITU-R BT.2087 and by CSS Color 4.
+TO_BT2020 = [[0.6274, 0.3293, 0.0433], [0.0691, 0.9195, 0.0114], [0.0164, 0.0880, 0.8956]]
+TO_P3 = [[0.8225, 0.1775, 0], [0.0332, 0.9668, 0], [0.0171, 0.0724, 0.9105]]
+TO_SRGB = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
+#: The weights of red and blue in luma of BT.601, BT.709 and BT.2020.
+BT601, BT709, BT2020 = (0.299, 0.114), (0.2126, 0.0722), (0.2627, 0.0593)
 
 
 def textured(level: int, blur: int) -> NDArray[np.uint8]:
@@ -31,14 +39,69 @@ def textured(level: int, blur: int) -> NDArray[np.uint8]:
     return frame
 
 
-def write_video(file: Path, frames: Sequence[NDArray[np.uint8]]) -> None:
+def write_video(
+    file: Path,
+    frames: Sequence[NDArray[np.uint8]],
+    codec: str = "mpeg4",
+    pixels: tuple[str, str] = ("rgb24", "yuv420p"),
+    colours: tuple[int, int, int] = (2, 2, 2),
+    aspect: Fraction = Fraction(1),
+) -> None:
+    """Write a video.
+
+    Args:
+        file: The video.
+        frames: Its frames.
+        codec: FFmpeg's name of the codec.
+        pixels: The formats of the frames, and of the video.
+        colours: Primaries, curve and matrix by ITU-T H.273.
+        aspect: Width by height of a pixel.
+    """
     with av.open(str(file), "w") as container:
-        stream = container.add_stream("mpeg4", rate=Fraction(10))
-        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        stream = container.add_stream(codec, rate=Fraction(10))
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, pixels[1]
         stream.bit_rate = 4_000_000
-        for pixels in frames:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
+        context = stream.codec_context
+        context.color_primaries, context.color_trc, context.colorspace = colours
+        context.sample_aspect_ratio = aspect
+        for frame in frames:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format=pixels[0])))
         container.mux(stream.encode(None))
+
+
+def turn(file: Path) -> None:
+    """Write a quarter turn clockwise into the header of an MP4."""
+    content = file.read_bytes()
+    at = content.index(UPRIGHT, content.index(b"tkhd"))
+    file.write_bytes(content[:at] + QUARTER_TURN + content[at + len(UPRIGHT) :])
+
+
+def patches(to_primaries: list[list[float]], luma: tuple[float, float]) -> NDArray[np.uint8]:
+    """Stripes of `PATCHES` with sRGB's curve, as 4:2:0 of limited range [HEIGHT * 3 / 2, WIDTH]."""
+    srgb = np.array(PATCHES) / 255
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    linear = linear @ np.transpose(to_primaries)
+    red, green, blue = np.where(
+        linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055
+    ).T
+    of_red, of_blue = luma
+    y = of_red * red + (1 - of_red - of_blue) * green + of_blue * blue
+    u, v = (blue - y) / (2 - 2 * of_blue), (red - y) / (2 - 2 * of_red)
+    stripe = WIDTH // len(PATCHES)
+    planes = [
+        np.tile(np.repeat(np.round(16 + 219 * y), stripe), HEIGHT),
+        *(np.tile(np.repeat(np.round(128 + 224 * c), stripe // 2), HEIGHT // 2) for c in (u, v)),
+    ]
+    return np.concatenate(planes).reshape(-1, WIDTH).astype(np.uint8)
+
+
+def disc(radius: float, aspect: Fraction) -> NDArray[np.uint8]:
+    """A frame with a white disc in its middle, as a camera of pixels of an aspect stores it."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    wide, high = max(aspect, Fraction(1)), max(1 / aspect, Fraction(1))
+    distance = np.hypot((x - WIDTH / 2) * float(wide), (y - HEIGHT / 2) * float(high))
+    edge = np.clip(radius + 0.5 - distance, 0, 1)
+    return np.repeat(np.round(235 * edge[..., None]).astype(np.uint8), 3, axis=2)
 
 
 def conf(file: Path, views: int) -> SceneConf:
@@ -68,16 +131,94 @@ def test_a_video_held_upright_is_turned_as_a_player_does(tmp_path: Path) -> None
     frame = textured(60, 0)
     frame[:, : WIDTH // 2] = 200  # bright on the left; a quarter turn clockwise puts it on top
     write_video(tmp_path / "a.mp4", [frame, frame])
-    content = (tmp_path / "a.mp4").read_bytes()
-    header = content.index(b"tkhd")
-    at = content.index(UPRIGHT, header)
-    turned = content[:at] + QUARTER_TURN + content[at + len(UPRIGHT) :]
-    (tmp_path / "b.mp4").write_bytes(turned)
-    scene = scenes.resolve(conf(tmp_path / "b.mp4", 2), tmp_path)
+    turn(tmp_path / "a.mp4")
+    scene = scenes.resolve(conf(tmp_path / "a.mp4", 2), tmp_path)
     image = images.read(scene.files["frame_0000"])
     assert image.shape == (WIDTH, HEIGHT, 3)
     assert image[: WIDTH // 3].mean() * 255 == pytest.approx(200, abs=6)
     assert image[-WIDTH // 3 :].mean() * 255 < 100
+
+
+@pytest.mark.parametrize(
+    ("colours", "to_primaries", "luma"),
+    [
+        ((2, 2, 2), TO_SRGB, BT601),
+        ((6, 6, 6), TO_SRGB, BT601),
+        ((1, 1, 1), TO_SRGB, BT709),
+        ((12, 13, 1), TO_P3, BT709),
+        ((9, 14, 9), TO_BT2020, BT2020),
+    ],
+    ids=["unspecified", "BT.601", "BT.709", "Display P3", "BT.2020"],
+)
+def test_colours_are_converted_to_srgb(
+    tmp_path: Path,
+    colours: tuple[int, int, int],
+    to_primaries: list[list[float]],
+    luma: tuple[float, float],
+) -> None:
+    frame = patches(to_primaries, luma)
+    write_video(tmp_path / "a.mkv", [frame] * 2, "ffv1", ("yuv420p", "yuv420p"), colours)
+    scene = scenes.resolve(conf(tmp_path / "a.mkv", 2), tmp_path)
+    stripe = WIDTH // len(PATCHES)
+    middles = images.read(scene.files["frame_0000"])[HEIGHT // 2, stripe // 2 :: stripe] * 255
+    assert np.abs(middles - PATCHES).max() <= 4  # 8 bits of YUV, and of RGB in between
+
+
+@pytest.mark.parametrize(("transfer", "name"), [(16, "PQ"), (18, "HLG")])
+def test_hdr_is_refused_as_in_photographs(tmp_path: Path, transfer: int, name: str) -> None:
+    colours = (9, transfer, 9)
+    frames = [textured(90, 0)] * 2
+    write_video(tmp_path / "a.mp4", frames, colours=colours)
+    write_video(tmp_path / "b.avi", frames, "libx264", colours=colours)  # it says so in the stream
+    # The decoder of this one forgets what the container says.
+    write_video(tmp_path / "c.mov", frames, "prores_ks", ("rgb24", "yuv422p10le"), colours)
+    for file in ("a.mp4", "b.avi", "c.mov"):
+        with pytest.raises(ImageError) as caught:
+            scenes.resolve(conf(tmp_path / file, 2), tmp_path)
+        assert f"{file}: its brightness is HDR ({name}); save it as SDR" in str(caught.value)
+
+
+@pytest.mark.parametrize("aspect", [Fraction(4, 3), Fraction(8, 9)], ids=str)
+@pytest.mark.parametrize("is_turned", [False, True], ids=["level", "turned"])
+def test_a_disc_of_oblong_pixels_is_shown_round(
+    tmp_path: Path, aspect: Fraction, is_turned: bool
+) -> None:
+    write_video(tmp_path / "a.mp4", [disc(24, aspect)] * 2, aspect=aspect)
+    size = (64, 128) if aspect > 1 else (72, 96)
+    if is_turned:
+        turn(tmp_path / "a.mp4")
+        size = size[::-1]
+    scene = scenes.resolve(conf(tmp_path / "a.mp4", 2), tmp_path)
+    image = images.read(scene.files["frame_0000"])
+    assert image.shape == (*size, 3)
+    weight = image[..., 1] * (255 / 235)
+    assert weight.sum() == pytest.approx(np.pi * 24**2, rel=0.02)
+    for axis, length in enumerate(size):
+        across = weight.sum(axis=1 - axis)
+        position = np.arange(length) + 0.5 - length / 2
+        assert across @ position / across.sum() == pytest.approx(0, abs=0.1)
+        # The mean square of a coordinate in a disc is a quarter of its squared radius.
+        assert across @ position**2 / across.sum() == pytest.approx(24**2 / 4, rel=0.03)
+
+
+def test_the_aspect_may_be_in_the_stream_alone(tmp_path: Path) -> None:
+    write_video(tmp_path / "a.mp4", [disc(24, Fraction(2))] * 2, aspect=Fraction(2))
+    content = (tmp_path / "a.mp4").read_bytes()
+    assert content.count(b"pasp") == 1
+    (tmp_path / "a.mp4").write_bytes(content.replace(b"pasp", b"free"))
+    scene = scenes.resolve(conf(tmp_path / "a.mp4", 2), tmp_path)
+    assert images.size(scene.files["frame_0000"]) == (2 * WIDTH, HEIGHT)
+
+
+def test_frames_that_are_too_large_once_pixels_are_square_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(images, "MAX_PIXELS", WIDTH * HEIGHT)
+    write_video(tmp_path / "a.mp4", [textured(90, 0)] * 2)
+    scenes.resolve(conf(tmp_path / "a.mp4", 2), tmp_path / "square")
+    write_video(tmp_path / "b.mp4", [textured(90, 0)] * 2, aspect=Fraction(2))
+    with pytest.raises(ImageError, match=r"b\.mp4: its frames have 192 x 64 pixels, too many"):
+        scenes.resolve(conf(tmp_path / "b.mp4", 2), tmp_path)
 
 
 def test_too_few_frames_no_video_and_no_package_are_named(

@@ -2,12 +2,16 @@
 
 The frames are divided into as many parts as views are wanted, and the sharpest of each part is
 taken. Sharpness is the variance of the Laplacian of the brightness [pechpacheco2000], at a reduced
-size, where the noise of the sensor counts little. Nothing here imports av before frames are read.
+size, where the noise of the sensor counts little. Frames are taken as a player shows them: with
+square pixels, upright and in sRGB. HDR is refused, as in photographs. Nothing here imports av
+before frames are read.
 """
 
 from __future__ import annotations
 
 import logging
+from dataclasses import dataclass
+from fractions import Fraction
 from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
@@ -15,7 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from xrgs.capture import images
+from xrgs.capture import colour, images
 from xrgs.capture.scenes import rendered
 from xrgs.capture.scenes.scene import Scene, check_views, label
 from xrgs.errors import UnreadableError, XrgsError
@@ -41,9 +45,19 @@ _SHARPNESS_SIDE = 640
 #: The containers that are read, by FFmpeg's names. Others, such as playlists, lead to other files.
 _CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg"
 
-
 #: The source files that decide the frames, relative to the package.
-_SOURCES = ("capture/images.py", "capture/scenes/video.py")
+_SOURCES = ("capture/colour.py", "capture/images.py", "capture/scenes/video.py")
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """A decoded frame, and how a player shows it."""
+
+    decoded: VideoFrame
+    encoding: colour.Encoding | None
+    """The colours that the video names; None where they are sRGB's or not named."""
+    size: tuple[int, int]
+    """Width and height with square pixels, before it is turned, px."""
 
 
 class VideoScene:
@@ -89,13 +103,13 @@ def extract(file: Path, names: Sequence[str], folder: Path) -> None:
     """Write the sharpest frames of a video as `<name>.png` to a folder, as a player shows them.
 
     Raises:
-        ImageError: The file is not a video, or its frames are too large.
+        ImageError: The file is not a video, it is HDR, or its frames are too large.
         XrgsError: It has fewer frames than names.
     """
     with ProgressBar("sharpness of frames", "frame", None) as bar:
         sharpness = []
         for frame in _frames(file):
-            sharpness.append(measure_sharpness(_brightness(frame)))
+            sharpness.append(measure_sharpness(_brightness(frame.decoded)))
             bar.update(1)
     if len(sharpness) < len(names):
         raise XrgsError(
@@ -105,7 +119,7 @@ def extract(file: Path, names: Sequence[str], folder: Path) -> None:
     with ProgressBar("frames", "frame", len(names)) as bar:
         for number, frame in enumerate(_frames(file)):
             if number in chosen:
-                images.save(folder / f"{chosen[number]}.png", _upright(frame), durable=False)
+                images.save(folder / f"{chosen[number]}.png", _shown(frame), durable=False)
                 bar.update(1)
 
 
@@ -125,7 +139,7 @@ def measure_sharpness(brightness: NDArray[np.uint8]) -> float:
     return float(laplace(brightness.astype(np.float32)).var())
 
 
-def _frames(file: Path) -> Iterator[VideoFrame]:
+def _frames(file: Path) -> Iterator[_Frame]:
     """Decode the frames of the first video stream.
 
     What can't be decoded ends the video with a warning where frames came before it.
@@ -140,17 +154,31 @@ def _frames(file: Path) -> Iterator[VideoFrame]:
         ):
             if not container.streams.video:
                 raise images.ImageError(f"{file}: it has no video")
-            container.streams.video[0].thread_type = "AUTO"
-            for frame in container.decode(video=0):
-                if frame.width * frame.height > images.MAX_PIXELS:
-                    size = f"{frame.width} x {frame.height}"
+            video = container.streams.video[0]
+            video.thread_type = "AUTO"
+            # Asked before frames are decoded: some decoders forget what the container says.
+            codec, aspect = video.codec_context, video.sample_aspect_ratio or Fraction(1)
+            encoding = colour.from_h273(codec.color_primaries, codec.color_trc)
+            for frame in container.decode(video):
+                width, height = _square(frame.width, frame.height, aspect)
+                if width * height > images.MAX_PIXELS:
+                    size = f"{width} x {height}"
                     raise images.ImageError(f"{file}: its frames have {size} pixels, too many")
-                yield frame
+                yield _Frame(frame, encoding, (width, height))
                 number += 1
+    except colour.ColourError as error:
+        raise images.ImageError(f"{file}: {error}") from error
     except (av.FFmpegError, OSError) as error:
         if number == 0:
             raise images.ImageError(f"{file}: unreadable as a video ({error})") from error
         _log.warning("%s", for_line(f"{file}: ends after frame {number} ({error})"))
+
+
+def _square(width: int, height: int, aspect: Fraction) -> tuple[int, int]:
+    """Return the size at which pixels of an aspect (width / height) are square: never smaller."""
+    if aspect > 1:
+        return round(width * aspect), height
+    return width, round(height / aspect)
 
 
 def _brightness(frame: VideoFrame) -> NDArray[np.uint8]:
@@ -162,8 +190,9 @@ def _brightness(frame: VideoFrame) -> NDArray[np.uint8]:
     return small.to_ndarray().astype(np.uint8)
 
 
-def _upright(frame: VideoFrame) -> images.ImageArray:
-    """Return a frame [H, W, 3] in 0..1, turned as its player would."""
-    image = frame.to_ndarray(format="rgb24")
-    turned = np.rot90(image, round(frame.rotation / 90) % 4)
-    return np.ascontiguousarray(turned, dtype=np.float32) / np.float32(255)
+def _shown(frame: _Frame) -> images.ImageArray:
+    """Return a frame [H, W, 3] in 0..1: in sRGB, with square pixels, and turned."""
+    pixels = frame.decoded.to_ndarray(format="rgb24")
+    image, _ = colour.convert(pixels, None, frame.encoding)
+    turned = np.rot90(images.resize(image, *frame.size), round(frame.decoded.rotation / 90) % 4)
+    return np.ascontiguousarray(turned)
