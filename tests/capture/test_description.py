@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import resource
 import shutil
 import zlib
@@ -15,7 +17,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from xrgs.capture import images
+from xrgs.capture import description, images, variant
 from xrgs.capture.contact_sheet import COLOURS, contact_sheet
 from xrgs.capture.description import SfmReport, describe, views_table
 from xrgs.capture.views import Variant, View
@@ -106,6 +108,24 @@ def test_a_variant_is_built_described_and_drawn(xrgs_data: Run, tmp_path: Path) 
     assert code == 1
     assert out == ""
     assert "variant.json: No such file or directory" in err
+
+
+def test_a_sheet_that_can_not_be_written_here_says_how_to_name_another(
+    mixed: Variant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def unwritable(_: Path) -> None:
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
+    monkeypatch.setattr(variant, "load", lambda _: mixed)
+    monkeypatch.setattr(description, "read_report", lambda _: SfmReport())
+    monkeypatch.setattr(description, "atomic_writer", unwritable)
+    with pytest.raises(XrgsError) as caught:
+        describe(tmp_path)
+    assert str(caught.value) == (
+        "the sheet key-hash.png can't be written here (Permission denied); give --out=FILE.png"
+    )
+    with pytest.raises(XrgsError, match=r"^out=x\.png: can't be written"):
+        describe(tmp_path, Path("x.png"))
 
 
 def test_the_table_has_a_row_a_view_and_leaves_originals_out(mixed: Variant) -> None:

@@ -299,9 +299,20 @@ def photographs(folder: Path, count: int, size: tuple[int, int] = (120, 80)) -> 
 @pytest.mark.parametrize(
     ("count", "size", "changes", "error"),
     [
-        (2, (120, 80), (), "1 HR, 0 LR and 1 test views; at least one of each class and two"),
+        (
+            2,
+            (120, 80),
+            (),
+            "1 HR, 0 LR and 1 test views; .* needed. 1 of 2 photographs is held out: "
+            "variant.test_every=0 (tests are then on the training views), or add photographs",
+        ),
         (5, (40, 30), (), "0 photograph(s) can be used.*lower variant.factor to 2"),
-        (5, (120, 80), ("variant.test=[1,2,3,4]",), "1 HR, 0 LR and 4 test views"),
+        (
+            5,
+            (120, 80),
+            ("variant.test=[1,2,3,4]",),
+            "1 HR, 0 LR and 4 test views; .*4 of 5 photographs are held out: name fewer or others",
+        ),
         (5, (120, 80), ("variant.tags=megapixels",), "every training view is HR"),
     ],
 )
@@ -317,9 +328,22 @@ def test_a_plan_says_what_no_variant_can_be_made_of(
     scene = photographs(tmp_path / "scene", count, size)
     conf = compose("scene=folder", f"scene.path={scene}", *changes)
     planned = variants.plan(conf, store, allow_build=False)
-    assert re.search(error.replace("(s)", r"\(s\)"), planned.error or "")
+    assert re.search(re.sub(r"[()]", r"\\\g<0>", error), planned.error or "")
     with pytest.raises(XrgsError):  # the build says the same, or asks more of SfM
         variant.build(conf.scene, conf.variant, store.variants, store.scenes)
+
+
+def test_photographs_of_which_too_few_are_trained_on_are_refused_before_sfm(
+    compose: Callable[..., Conf], store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    conf = compose("scene=folder", f"scene.path={photographs(tmp_path / 'scene', 2)}")
+    monkeypatch.setattr(worker, "run_in_child", unexpected)
+    planned = variants.plan(conf, store, allow_build=True)
+    assert "1 of 2 photographs is held out: variant.test_every=0" in str(planned.error)
+    assert not planned.remembered
+    monkeypatch.setattr(worker, "run_in_child", fail)  # with every photograph, SfM is tried
+    conf.variant.test_every = 0
+    assert variants.plan(conf, store, allow_build=True).error == "SfM placed too few views"
 
 
 def test_a_plan_says_that_no_view_is_lr(

@@ -133,6 +133,9 @@ def describe(folder: Path, out: Path | None = None) -> str:
         with atomic_writer(file) as stream:
             images.write_png(stream, sheet)
     except OSError as error:
+        if out is None:
+            why = f"the sheet {file} can't be written here ({error.strerror}); give --out=FILE.png"
+            raise XrgsError(why) from error
         raise XrgsError(f"out={file}: can't be written ({error})") from error
     more = [f"Contact sheet: {file}", *(f"  {note}" for note in notes)]
     return "\n".join([table, *sfm, *map(for_line, more)])

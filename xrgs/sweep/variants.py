@@ -20,7 +20,7 @@ from xrgs.sweep.jobs import worker
 from xrgs.sweep.jobs.supervise import Limits
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
     from xrgs.config import Conf, SceneConf
     from xrgs.experiment.store import Store
@@ -54,6 +54,7 @@ def build(conf: Conf, store: Store) -> str:
         StoreGoneError: The store is no longer there.
         XrgsError: The photographs are missing, or can't be made into a variant.
     """
+    _check_held_out(scenes.names(conf.scene, conf.variant.long_side), conf)  # SfM takes minutes
     log_line(f"{scenes.label(conf.scene)}: building the mixed-resolution variant")
     request = {"conf": asdict(conf), "store": str(store.path)}
     answer = worker.run_in_child("variant", request, Limits(), lambda _: store.check_not_gone())
@@ -232,8 +233,33 @@ def _expected_notes(conf: Conf, store: Store) -> tuple[str, ...]:
         photos = photographs.expected_photographs(scene, conf.variant)
         names, sizes = photos.names, [photo.size for photo in photos.all]
         notes = [*scene.notes, *photos.notes]
+    _check_held_out(names, conf, notes)
     parts = split.split_before_sfm(names, sizes, conf.variant)
-    if lacking := split.shortage(parts, set(range(len(names))), conf.variant):
-        where = f"scene {scenes.label(conf.scene)} of {len(names)} photographs"
-        raise XrgsError("; ".join([f"{where}: {lacking}", *notes]))
     return *notes, *split.split_notes(parts, conf.variant)
+
+
+def _check_held_out(names: Sequence[str], conf: Conf, notes: Iterable[str] = ()) -> None:
+    """Refuse photographs of which too few are trained on, or none tested, even if all are placed.
+
+    Args:
+        names: The names of the photographs, sorted. Some may turn out to be unreadable, and leave
+            even fewer.
+        conf: A cell's config.
+        notes: What else is said of the photographs.
+
+    Raises:
+        XrgsError: There are too few; the message says what helps.
+    """
+    parts = split.split_views(names, conf.variant)
+    lacking = split.shortage(parts, set(range(len(names))), conf.variant)
+    if not lacking:
+        return
+    held_out = len(parts.test)
+    which = f"{held_out} of {len(names)} photographs {'is' if held_out == 1 else 'are'} held out"
+    helps = "variant.test_every=0 (tests are then on the training views)"
+    if conf.variant.test:
+        helps = "name fewer or others in variant.test"
+    where = f"scene {scenes.label(conf.scene)}"
+    raise XrgsError(
+        "; ".join([f"{where}: {lacking}. {which}: {helps}, or add photographs", *notes])
+    )

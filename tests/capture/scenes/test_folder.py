@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 from tests.capture.scene_confs import scene_conf
 from xrgs.capture import images, scenes
@@ -65,7 +66,7 @@ def test_copies_are_measured_by_their_largest_photograph(fill: Fill, tmp_path: P
             ["e\N{COMBINING ACUTE ACCENT}.png", "\N{LATIN SMALL LETTER E WITH ACUTE}.png"],
             "one name",
         ),
-        (["a.png", "\udcff.png"], "udcff.*rename it"),
+        (["a.png", "\udcff.png"], r"only a\.png in it; .*; rename: '\\udcff\.png'"),
     ],
 )
 def test_a_folder_without_a_scene_is_refused(
@@ -161,6 +162,54 @@ def test_names_that_nested_folders_share_are_refused(fill: Fill, tmp_path: Path)
     fill(tmp_path / "x" / "a", "b_c.png", size=(44, 30))
     with pytest.raises(XrgsError, match=r"two images of one name"):
         scenes.fingerprint(scene_of(f"{tmp_path / 'x'}/**"))
+
+
+def test_photographs_whose_names_can_not_be_used_are_left_out_by_name(
+    fill: Fill, tmp_path: Path
+) -> None:
+    """Before copies are, so that a copy of another name stays."""
+    conf = fill(tmp_path / "x", "b.png", "c.png")
+    only = scenes.fingerprint(conf)
+    for name in ("IMG\n5.png", "a\\5.png", "\udcff.png"):
+        (tmp_path / "x" / name).write_bytes((tmp_path / "x" / "b.png").read_bytes())
+    scene = scenes.resolve(conf, tmp_path)
+    assert (list(scene.files), scene.fingerprint) == (["b", "c"], only)
+    (note,) = scene.notes
+    assert note.startswith("3 images left out, whose name has a backslash, a control character or")
+    assert note.endswith(r"rename: 'IMG\n5.png', 'a\\5.png', '\udcff.png'")
+
+
+def test_a_folder_that_is_left_out_may_have_a_name_that_is_no_text(
+    fill: Fill, tmp_path: Path
+) -> None:
+    fill(tmp_path / "x", "a.png", "b.png")
+    fill(tmp_path / "x" / "masks\udcff", "a.png")
+    (note,) = scenes.resolve(scene_of(f"{tmp_path / 'x'}/**"), tmp_path).notes
+    assert note.startswith("images left out: 1 in masks  (masks; scene.masks=")
+    note.encode()
+
+
+def test_what_is_nested_too_deep_is_left_out_by_name(fill: Fill, tmp_path: Path) -> None:
+    eight = "a/b/c/d/e/f/g/h"
+    fill(tmp_path / "x" / eight, "p.png", "q.png")
+    fill(tmp_path / "x" / eight / "i", "r.png")
+    fill(tmp_path / "x" / eight / "i" / "j", "s.png")
+    left_out = f"images left out: 2 in {eight}/i (nested more than 8 folders deep; move them up)"
+    scene = scenes.resolve(scene_of(f"{tmp_path / 'x'}/**"), tmp_path)
+    assert list(scene.files) == ["a_b_c_d_e_f_g_h_p", "a_b_c_d_e_f_g_h_q"]
+    assert scene.notes == (left_out,)
+    flat = scenes.resolve(fill(tmp_path / "x", "t.png", "u.png"), tmp_path)
+    assert flat.notes[1:] == (left_out,)
+
+
+def test_grey_photographs_among_those_in_colour_are_named(fill: Fill, tmp_path: Path) -> None:
+    folder = tmp_path / "x"
+    conf = fill(folder, "a.jpg", "b.jpg", "c.jpg")
+    for name in ("b.jpg", "c.jpg"):
+        Image.open(folder / name).convert("L").save(folder / name)
+    assert scenes.resolve(conf, tmp_path).notes == ("grey, where others have colour: b.jpg, c.jpg",)
+    (folder / "a.jpg").unlink()
+    assert scenes.resolve(conf, tmp_path).notes == ()
 
 
 def test_what_is_not_read_is_named(fill: Fill, tmp_path: Path) -> None:

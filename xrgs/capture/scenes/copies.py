@@ -72,7 +72,7 @@ def _is_whole(file: Path) -> bool:
 def _thumbnail(file: Path) -> NDArray[np.float64] | None:
     """Return a grey thumbnail [_FINE, _FINE]; None where the file can't be read."""
     try:
-        return images.thumbnail(file, _FINE).astype(np.float64)
+        return np.asarray(images.thumbnail(file, _FINE), np.float64)
     except images.ImageError:
         return None
 
@@ -283,7 +283,8 @@ def _as_shot(file: Path) -> str:
 def _averaged(thumbnail: NDArray[np.float64], side: int) -> NDArray[np.float64]:
     """Average a thumbnail to a side that divides its own."""
     block = len(thumbnail) // side
-    return thumbnail.reshape(side, block, side, block).mean(axis=(1, 3))
+    blocks = thumbnail.reshape(side, block, side, block)
+    return np.asarray(blocks.mean(axis=(1, 3)), np.float64)
 
 
 def _correlation(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:

@@ -14,6 +14,7 @@ import re
 import unicodedata
 from collections import defaultdict
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
 from itertools import chain
@@ -30,7 +31,7 @@ from xrgs.errors import UnreadableError, XrgsError
 from xrgs.runtime.text import listed
 from xrgs.safeio.files import is_name
 from xrgs.safeio.paths import user_path
-from xrgs.safeio.sanitize import counted
+from xrgs.safeio.sanitize import counted, for_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -69,8 +70,9 @@ _OF_OTHERS = re.compile(
 #: What a name has before or after the name of the photograph that an image was made of.
 _ADDED = rf"(?:{_MASK}|depth|disparity|normals?|thumb|thumbnail)"
 _ADDED_BEFORE, _ADDED_AFTER = re.compile(rf"^{_ADDED}[\W_]?"), re.compile(rf"[\W_]?{_ADDED}$")
-#: The deepest nesting of folders that is searched.
+#: The deepest nesting of folders that is searched, and what is said of those below it.
 _MAX_DEPTH = 8
+_DEEP = f"nested more than {_MAX_DEPTH} folders deep; move them up"
 #: A picture that is longer for its width than this, and so many times longer than the others, is
 #: called a panorama. It would set the size of all others, and SfM can't place it. Our choice.
 _PANORAMA, _TIMES = 2.2, 1.6
@@ -125,8 +127,8 @@ def look(path: str | None, long_side: int, masks: str | None = None) -> Listing:
 
     Raises:
         UnreadableError: The folder or a file in it can't be read now.
-        XrgsError: The folder is missing, has fewer than two images or two of one name, a name can't
-            be used, or images are HEIC and the package that reads it is not installed.
+        XrgsError: The folder is missing, has fewer than two images that can be used or two of one
+            name, or images are HEIC and the package that reads it is not installed.
     """
     if not path:
         raise XrgsError("scene.path is empty: give the folder of photographs, scene.path=...")
@@ -140,11 +142,14 @@ def look(path: str | None, long_side: int, masks: str | None = None) -> Listing:
         known = None if masks is None else user_path(masks).resolve()
         found = (_all_below if nested else _inside)(folder, long_side, known)
         listed_files = [file for inside in found.folders.values() for file in inside]
-        photographs, made = _photographs(listed_files, folder)
+        named, unnamed = _named(listed_files, folder, nested=nested)
+        photographs, made = _photographs([*named], folder)
         single, copies = without_copies(photographs, folder, found.other_sizes)
         files, shapes = _without_panoramas(single, folder)
         not_read = _not_read({folder, *found.folders}, files)
-        notes = (*found.notes, *made, *copies, *shapes, *not_read)
+        grey = _grey(files, folder)
+        said = (*found.notes, *unnamed, *made, *copies, *shapes, *grey, *not_read)
+        notes = tuple(map(for_line, said))  # names in them may be no text, which no file takes
     except OSError as error:
         raise UnreadableError(f"{error.filename}: {error.strerror}; try again") from error
     if len(files) < 2:
@@ -153,8 +158,7 @@ def look(path: str | None, long_side: int, masks: str | None = None) -> Listing:
         why = f"{count} in it; two or more are needed ({suffixes})"
         raise XrgsError("; ".join([f"scene.path={folder}: {why}", *notes]))
     _check_heic(files)
-    named = [(_view_name(file, folder if nested else file.parent), file) for file in files]
-    return Listing(_by_name(named), notes)
+    return Listing(_by_name([(named[file], file) for file in files]), notes)
 
 
 #: Images by their folder.
@@ -223,8 +227,6 @@ def _folders(
 
     Hidden folders and the folder of `scene.masks` are passed over in silence.
     """
-    if depth > _MAX_DEPTH:
-        raise XrgsError(f"{folder}: folders are nested more than {_MAX_DEPTH} deep")
     yield folder
     for inside in sorted(folder.iterdir()):
         if inside.name.startswith(".") or not inside.is_dir() or inside.resolve() == masks:
@@ -233,6 +235,8 @@ def _folders(
             passed[_LINKS].append(inside)
         elif what := _made_by_programs(inside):
             passed[what].append(inside)
+        elif depth == _MAX_DEPTH:
+            passed[_DEEP].append(inside)
         else:
             yield from _folders(inside, passed, masks, depth + 1)
 
@@ -259,8 +263,15 @@ def _is_link_into(inside: Path, root: Path) -> bool:
 
 def _count_anywhere(folder: Path) -> int:
     """Count the images in a folder and below it, as far as they can be listed now."""
-    names = (name for _, _, names in os.walk(folder) for name in names)
-    return sum(1 for name in names if Path(name).suffix.lower() in images.SUFFIXES)
+    count, waiting = 0, [str(folder)]
+    while waiting:  # `os.walk` calls itself for each folder, and they may be nested a thousand deep
+        with suppress(OSError), os.scandir(waiting.pop()) as entries:
+            for entry in entries:
+                if entry.is_dir(follow_symlinks=False):
+                    waiting.append(entry.path)
+                else:
+                    count += Path(entry.name).suffix.lower() in images.SUFFIXES
+    return count
 
 
 def _in_other_folders(folder: Path, taken: _Tree, masks: Path | None) -> list[str]:
@@ -273,11 +284,16 @@ def _in_other_folders(folder: Path, taken: _Tree, masks: Path | None) -> list[st
         for inside, files in images_in.items():
             if files[0].stem.casefold() in stems and _is_mask(files[0]):
                 passed[_MASKS].append(inside)
-    except (OSError, XrgsError) as error:
+    except OSError as error:
         return [f"the folders below can't be searched for more images ({error})"]
     counts = {f: len(files) for f, files in images_in.items() if f not in passed[_MASKS]}
     all_below = f"scene.path={folder}{ALL_BELOW} takes the images of all folders"
-    return _left_out(counts, folder, all_below) + _masks_left_out(passed, folder)
+    deep = {inside: _count_anywhere(inside) for inside in passed.get(_DEEP, ())}
+    return [
+        *_left_out(counts, folder, all_below),
+        *_left_out(deep, folder, _DEEP),
+        *_masks_left_out(passed, folder),
+    ]
 
 
 def _masks_left_out(passed: Mapping[str, Sequence[Path]], folder: Path) -> list[str]:
@@ -399,20 +415,46 @@ def _without_panoramas(files: Sequence[Path], folder: Path) -> tuple[list[Path],
     return [file for file in files if file not in panoramas], notes
 
 
-def _view_name(file: Path, folder: Path) -> str:
-    """Return the name of the view of a photograph in or below a folder."""
-    return "_".join(file.relative_to(folder).with_suffix("").parts)
+def _grey(files: Sequence[Path], folder: Path) -> list[str]:
+    """Say which photographs are grey, where others have colour."""
+    grey = [file for file in files if _is_grey(file)]
+    if not grey or len(grey) == len(files):
+        return []
+    names = listed([str(file.relative_to(folder)) for file in sorted(grey)])
+    return [f"grey, where others have colour: {names}"]
+
+
+@remembered
+def _is_grey(file: Path) -> bool:
+    """Return whether a JPEG is grey; one channel of other formats may be a palette's colours."""
+    try:
+        return file.suffix.lower() in {".jpg", ".jpeg"} and not images.has_colour(file)
+    except images.ImageError:
+        return False
+
+
+def _named(
+    files: Sequence[Path], folder: Path, *, nested: bool
+) -> tuple[dict[Path, str], list[str]]:
+    """Name the views of files; leave out files whose names can't be used, and say so."""
+    names = {
+        file: "_".join(file.relative_to(folder if nested else file.parent).with_suffix("").parts)
+        for file in files
+    }
+    unusable = [file for file, name in names.items() if not is_name(name)]
+    if not unusable:
+        return names, []
+    # As Python writes them: a line break, or bytes that are no text, can't be shown.
+    shown = listed([repr(str(file.relative_to(folder))) for file in unusable])
+    why = "a backslash, a control character or bytes that are not valid Unicode, or is too long"
+    notes = [f"{counted(len(unusable), 'image')} left out, whose name has {why}; rename: {shown}"]
+    return {file: name for file, name in names.items() if file not in unusable}, notes
 
 
 def _by_name(named: Sequence[tuple[str, Path]]) -> dict[str, Path]:
-    """Return files by name, sorted; refuse names that can't be used, and two that are one."""
+    """Return files by name, sorted; refuse two names that are one."""
     seen: dict[str, Path] = {}
     for name, file in named:
-        if not is_name(name):
-            raise XrgsError(
-                f"{str(file)!r}: its name has a backslash, a control character or bytes that are "
-                "not valid Unicode, or is too long; rename it"
-            )
         # On some file systems A and a, or an accent as one or two characters, are one name.
         key = unicodedata.normalize("NFC", name).casefold()
         if key in seen:
