@@ -423,7 +423,7 @@ def xrgs_data(
 
 
 @pytest.fixture(scope="session")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     """Debian's chromium without a screen, that reaches this machine alone; skipped without it."""
     webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
     found = {name: shutil.which(name) for name in ("chromium", "chromedriver")}
@@ -446,3 +446,10 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     driver = webdriver.Chrome(options=options, service=service)
     yield driver
     driver.quit()
+
+
+@pytest.fixture
+def browser(chromium: Any) -> Iterator[Any]:
+    """`chromium`, which shows nothing after the test: pages that draw take a core."""
+    yield chromium
+    chromium.get("about:blank")

@@ -17,7 +17,7 @@ from xrgs import load_gaussians
 from xrgs.capture.scenes import procedural, still_life
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-SIZE = (480, 360)
+SIZE = (320, 240)
 
 
 def read(name: str) -> Any:
