@@ -11,15 +11,17 @@ import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from xrgs.capture import description, images, variant
 from xrgs.capture.contact_sheet import COLOURS, contact_sheet
-from xrgs.capture.description import SfmReport, describe, views_table
+from xrgs.capture.description import SfmReport, describe, shared_cameras, views_table
+from xrgs.capture.frozen import Manifest, ViewEntry
 from xrgs.capture.views import Variant, View
 from xrgs.errors import XrgsError
 from xrgs.runtime.text import to_text
@@ -126,6 +128,25 @@ def test_a_sheet_that_can_not_be_written_here_says_how_to_name_another(
     )
     with pytest.raises(XrgsError, match=r"^out=x\.png: can't be written"):
         describe(tmp_path, Path("x.png"))
+
+
+@pytest.mark.parametrize("held_out", [True, False])
+def test_views_of_one_camera_are_named(held_out: bool) -> None:
+    """A copy is placed 0.05 degrees and 0.5 % off; neighbours are 0.5 degrees apart."""
+    angles, places = [0, 0.5, 1, 0.05, 0], [0, 0.1, 1, 0.005, 1]
+    splits: tuple[Literal["train", "test"], ...] = ("test", "train", "train", "train", "train")
+    K = np.eye(3).tolist()
+    views = []
+    for name, split, angle, place in zip("abcde", splits, angles, places, strict=True):
+        viewmat = np.eye(4)
+        viewmat[:3, :3] = Rotation.from_euler("y", angle, degrees=True).as_matrix()
+        viewmat[:3, 3] = viewmat[:3, :3] @ [-2 * place, 0, 0]
+        views.append(ViewEntry(name, split, "", "HR", 9, 9, K, viewmat.tolist(), 1.0))
+    said = shared_cameras(Manifest("k", "s", 5, held_out, tuple(views), {}))
+    copies = (
+        "views of one camera, as copies of a photograph are; remove one: a (test) and d (train)"
+    )
+    assert said == ([copies] if held_out else [])
 
 
 def test_the_table_has_a_row_a_view_and_leaves_originals_out(mixed: Variant) -> None:

@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from xrgs.capture import variant
+from tests.capture.manifests import one_view
+from xrgs.capture import description, variant
 from xrgs.capture.folders import TO_TRY
 from xrgs.config import Conf
 from xrgs.errors import StoreError, XrgsError
@@ -65,8 +66,9 @@ def remember_failure(conf: Conf, store: Store) -> None:
 
 
 @pytest.fixture
-def reported(store: Store) -> PlannedVariant:
+def reported(store: Store, monkeypatch: pytest.MonkeyPatch) -> PlannedVariant:
     """The variant `k-1`, of which the store has the report alone."""
+    monkeypatch.setattr(description, "read_manifest", lambda _: one_view())
     report = {"notes": ["icon.png left out"], "hr": ["a"], "tests": 1, "not_registered": ["b"]}
     (store.variants / "k-1").mkdir()
     write_json(store.variants / "k-1" / "report.json", report)
