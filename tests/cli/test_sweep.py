@@ -358,7 +358,7 @@ def test_captures_are_looked_for_in_data_root(sweep_here: SweepHere, tmp_path: P
     code, _, err = sweep_here("+sweeps=table2", "dry_run=true")
     assert "scene.path=data/captures/ollie" in err
     assert err.count("docs/study.md says where their photographs are from") == 1
-    assert "they belong into data/captures/reichstag, data/captures/ollie\n" in err
+    assert "they belong into data/captures/monstree, data/captures/ollie\n" in err
 
 
 def test_an_ablation_that_changes_nothing_is_named_in_the_plan(sweep_here: SweepHere) -> None:
