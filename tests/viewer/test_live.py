@@ -175,6 +175,7 @@ def test_a_frame_that_is_opened_takes_the_place_of_the_others(clock: SimpleNames
 
 @pytest.mark.slow
 def test_in_a_browser_both_models_move_as_one(model: MakeModel, browser: Any) -> None:
+    from selenium.common.exceptions import TimeoutException
     from selenium.webdriver.common.action_chains import ActionChains
     from selenium.webdriver.support.wait import WebDriverWait
 
@@ -192,18 +193,20 @@ def test_in_a_browser_both_models_move_as_one(model: MakeModel, browser: Any) ->
         return bool(first.std() > 5 and abs(first - second).mean() < 0.5)
 
     browser.get_log("browser")
+    # The driver gives the page 10 s for a screenshot, which drawing on a busy core may exceed.
+    wait = WebDriverWait(browser, 180, ignored_exceptions=[TimeoutException])
     one = model()
     with live.shown([one, one], 0, 40) as address:
         browser.get(address)
-        WebDriverWait(browser, 180).until(same)
-        before = panes()
+        wait.until(same)
+        before = wait.until(lambda _: panes())
         frame = browser.find_elements("css selector", "iframe")[1]
         drag = ActionChains(browser).move_to_element_with_offset(frame, -150, 150).click_and_hold()
         drag.move_by_offset(80, -20).release().perform()
-        WebDriverWait(browser, 180).until(
+        wait.until(
             lambda _: all(abs(a - b).mean() > 3 for a, b in zip(before, panes(), strict=True))
         )
-        WebDriverWait(browser, 180).until(same)
+        wait.until(same)
         said = [entry["message"] for entry in browser.get_log("browser")]
         # three.js says this of the splats of any page of viser's, once for each frame
         errors = [text for text in said if "rror" in text and "computeBoundingSphere" not in text]
