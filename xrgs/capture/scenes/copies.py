@@ -32,8 +32,9 @@ _SAMPLES = 3
 #: The sides of the thumbnails that are compared, px. In seven captures, neighbouring views have a
 #: correlation of 0.979 or less on fine ones, and of up to 0.997 on coarse ones. Photographs that
 #: were resized to 334 px and compressed anew have 0.997 or more on fine ones; resized to 80 px,
-#: 0.994 or more on coarse ones, and in their own size 0.9998. Fine ones tell whether two folders
-#: have the same photographs, and coarse ones whether names that are related then mislead.
+#: 0.994 or more on coarse ones, and in their own size 0.9998. Fine ones decide whether two folders
+#: have the same photographs. Coarse ones decide for each pair of such folders, and for each pair of
+#: related names in one folder.
 _FINE, _COARSE = 64, 16
 #: The least correlation of the thumbnails of one photograph, in two sizes and in one.
 _LEAST_ALIKE, _LEAST_ALIKE_SIZE = 0.985, 0.9995
