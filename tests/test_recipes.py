@@ -135,7 +135,7 @@ def test_a_metric_is_added_rescored_and_in_the_table(copy: Copy) -> None:
 
 
 def test_a_refactoring_is_proven_and_keeps_its_cells(copy: Copy) -> None:
-    file = copy.root / "xrgs/experiment/refactorings.json"
+    file = copy.root / "xrgs/safeio/refactorings.json"
     before = json.loads(file.read_text())
     copy.edit("splat/settings.py", "NOMINAL_STEPS = 30_000", "NOMINAL_STEPS = 3 * 10_000")
     assert "2 cells, 0 done" in done_cells(copy)
@@ -148,12 +148,35 @@ def test_a_refactoring_is_proven_and_keeps_its_cells(copy: Copy) -> None:
 
 
 def test_a_change_of_a_number_is_not_declared(copy: Copy) -> None:
-    file = copy.root / "xrgs/experiment/refactorings.json"
+    file = copy.root / "xrgs/safeio/refactorings.json"
     before = file.read_bytes()
     copy.edit("splat/settings.py", "NOMINAL_STEPS = 30_000", "NOMINAL_STEPS = 29_000")
     with pytest.raises(AssertionError, match="nothing is declared"):
         copy.run("store", "prove", "--store", "s", "--sample", "1")
     assert file.read_bytes() == before
+
+
+def test_a_refactoring_of_the_code_of_variants_is_proven_and_keeps_variants_and_cells(
+    copy: Copy,
+) -> None:
+    copy.edit("capture/sfm.py", "_TOTAL_FEATURES = 100_000", "_TOTAL_FEATURES = 100 * 1_000")
+    assert "2 cells, 0 done" in done_cells(copy)
+    printed = copy.run("store", "prove", "--store", "s")
+    assert "1 variant built again, the same bit for bit" in printed
+    declared = json.loads((copy.root / "xrgs/safeio/refactorings.json").read_text())
+    assert "declared in refactorings.json: variant/core\n" in printed
+    assert len(declared["variant/core"]) == 2
+    assert "2 cells, 2 done" in done_cells(copy)
+
+
+def test_other_cameras_are_not_declared(copy: Copy) -> None:
+    file = copy.root / "xrgs/safeio/refactorings.json"
+    before = file.read_bytes()
+    copy.edit("capture/sfm.py", "_SMALL_SIDE = 800", "_SMALL_SIDE = 8")
+    with pytest.raises(AssertionError, match="views, files differ; nothing is declared"):
+        copy.run("store", "prove", "--store", "s")
+    assert file.read_bytes() == before
+    assert "2 cells, 0 done" in done_cells(copy)
 
 
 def test_a_scene_kind(copy: Copy) -> None:

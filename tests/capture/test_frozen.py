@@ -43,7 +43,7 @@ def intact(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a frozen variant that no test changes."""
     home = tmp_path_factory.mktemp("intact")
     made = make(home)
-    return frozen.freeze(made, "key", made.folder, home).folder
+    return frozen.freeze(made, "key", made.folder, home, {}).folder
 
 
 @pytest.fixture
@@ -90,7 +90,9 @@ def test_a_mask_is_hashed_and_a_variant_without_masks_has_no_word_of_them(tmp_pa
     images.save_mask(file, np.ones((3, 4), np.bool_))
     views = (dataclasses.replace(masked.views[0], mask=file), masked.views[1])
     masked = dataclasses.replace(masked, views=views)
-    first, second = (frozen.freeze(made, "key", made.folder, tmp_path) for made in (plain, masked))
+    first, second = (
+        frozen.freeze(made, "key", made.folder, tmp_path, {}) for made in (plain, masked)
+    )
     assert "mask" not in (first.folder / "variant.json").read_text()
     assert first.id != second.id
     mask = second.folder / "images/test-masks/a.png"
@@ -212,7 +214,7 @@ def test_everything_is_on_the_disk_before_the_variant_has_its_name(
 ) -> None:
     """Each folder that holds a new name is synced before the rename, and the last one after."""
     made = make(tmp_path)
-    variant = frozen.freeze(made, "key", made.folder, tmp_path)
+    variant = frozen.freeze(made, "key", made.folder, tmp_path, {})
     named = disk_events.index(f"rename work to {variant.id}")
     assert {"sync work", "sync images", "sync points.npz"} <= set(disk_events[:named])
     assert disk_events[named + 1 :] == [f"sync {tmp_path.name}"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import pytest
 from xrgs.capture import images, scenes, sfm
 from xrgs.capture.scenes import motorcycle
 from xrgs.capture.scenes.scene import bundled_photograph
-from xrgs.config import SceneConf, SfmConf
+from xrgs.config import Conf, SceneConf, SfmConf
 
 StereoPair = tuple[Path, sfm.Reconstruction]
 
@@ -130,6 +131,29 @@ def test_its_points_lie_at_the_depths_of_the_published_disparity(stereo_pair: St
     good = np.isfinite(known)
     ratio = camera[good, 2] * (known[good] + offset)
     assert np.median(np.abs(ratio / np.median(ratio) - 1)) < 0.02
+
+
+def test_the_bits_are_those_of_any_number_of_threads(
+    compose: Callable[..., Conf], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    conf = compose("scene=procedural", "scene.views=6")
+    rendered = scenes.resolve(conf.scene, tmp_path, 320).files.values()
+    models = []
+    for threads in (1, 3):
+        monkeypatch.setattr(sfm, "usable_cores", lambda threads=threads: threads)
+        work = tmp_path / str(threads)
+        work.mkdir()
+        for file in rendered:
+            images.save(work / file.name, images.read(file))
+        inputs = [sfm.SfmImage(file.name, file.stem, "all") for file in rendered]
+        models.append(sfm.reconstruct(inputs, work, work, conf.variant.sfm))
+    one, three = models
+    assert one.report["registered"] == 6
+    assert np.array_equal(one.points, three.points)
+    assert np.array_equal(one.colors, three.colors)
+    for i in range(6):
+        assert np.array_equal(one.viewmats[i], three.viewmats[i])
+        assert one.lenses[i] == three.lenses[i]
 
 
 def test_colmaps_log_stays_in_the_work_folder(

@@ -40,7 +40,7 @@ def masked_variant(folder: Path) -> Variant:
     points = np.random.default_rng(0).uniform((-1, -1, 2), (1, 1, 4), (20, 3))
     colors = np.zeros((20, 3), np.uint8)
     variant = Variant("", made, "x", 2, True, tuple(views), points, colors, {})
-    return freeze(variant, "0" * 16, made, variants)
+    return freeze(variant, "0" * 16, made, variants, {})
 
 
 def test_each_image_has_a_mask_where_one_has(tmp_path: Path) -> None:
@@ -72,7 +72,7 @@ def test_without_masks_none_is_written(tmp_path: Path) -> None:
         images.save(file, images.read_png(view.file))
         views.append(View(**(vars(view) | {"file": file, "mask": None})))
     made = Variant(**(vars(variant) | {"id": "", "folder": plain, "views": tuple(views)}))
-    frozen = freeze(made, "1" * 16, plain, tmp_path / "variants")
+    frozen = freeze(made, "1" * 16, plain, tmp_path / "variants", {})
     export(frozen.folder, "nerfstudio", tmp_path / "out")
     assert not (tmp_path / "out" / "masks").exists()
     assert "mask_path" not in (tmp_path / "out" / "transforms.json").read_text()

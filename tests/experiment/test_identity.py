@@ -23,7 +23,7 @@ from xrgs.config import Conf
 from xrgs.errors import XrgsError
 from xrgs.evaluation import metrics, scoring
 from xrgs.experiment import identity
-from xrgs.safeio import code
+from xrgs.safeio import code, refactorings
 from xrgs.splat.backend import resolve_backend
 from xrgs.training.registry import BUILT_IN, modules_of
 
@@ -63,7 +63,7 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     ignored = shutil.ignore_patterns("*.so", "__pycache__", "html")
     home = shutil.copytree(PACKAGE, tmp_path / "xrgs", ignore=ignored)
     monkeypatch.setattr(code, "PACKAGE", home)
-    monkeypatch.setattr(identity, "REFACTORINGS", home / "experiment" / "refactorings.json")
+    monkeypatch.setattr(refactorings, "FILE", home / "safeio" / "refactorings.json")
     caches = (identity.training_code, scoring.scoring_code)
     for cached in caches:
         cached.cache_clear()
@@ -295,7 +295,7 @@ def test_a_declared_refactoring_keeps_all_ids(package: Path, confs: dict[str, Co
     assert identity.changed_code(trained) == ["core"]
     exact = identity.current_code(trained)["core"]
     text = f'{{"core": {{"{exact}": "{trained.code["core"]}"}}}}'
-    identity.REFACTORINGS.write_text(text)
+    refactorings.FILE.write_text(text)
     assert identity.changed_code(trained) == []
     identity.training_code.cache_clear()
     assert identity.cell_id(identity.cell_identity(conf, "v")) == identity.cell_id(trained)

@@ -51,7 +51,7 @@ def frozen_variant(made: MakeStore) -> Callable[[int], str]:
         points = np.random.default_rng(0).normal(size=(5, 3))
         colors = np.zeros((5, 3), np.uint8)
         variant = Variant("", folder, "fern", 5, True, tuple(views), points, colors, {})
-        return frozen.freeze(variant, f"{draw:016x}", folder, made.store.variants).id
+        return frozen.freeze(variant, f"{draw:016x}", folder, made.store.variants, {}).id
 
     return make
 

@@ -17,6 +17,7 @@ from xrgs.runtime import machine
 from xrgs.runtime.machine import (
     peak_rss,
     set_passive_openmp_wait,
+    set_portable_blas,
     set_torch_threads,
     single_torch_thread,
     usable_cores,
@@ -159,6 +160,23 @@ def test_openmps_threads_sleep_unless_the_environment_says_otherwise(
     monkeypatch.setenv("OMP_WAIT_POLICY", "active")
     set_passive_openmp_wait()
     assert os.environ["OMP_WAIT_POLICY"] == "active"
+
+
+def test_openblas_has_the_kernels_of_avx2_wherever_there_is_avx2(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.delenv("OPENBLAS_CORETYPE", raising=False)
+    cpuinfo = tmp_path / "cpuinfo"
+    set_portable_blas(cpuinfo)  # not Linux
+    cpuinfo.write_text("flags : fpu sse2 avx")
+    set_portable_blas(cpuinfo)
+    assert "OPENBLAS_CORETYPE" not in os.environ
+    cpuinfo.write_text("flags : fpu sse2 avx fma avx2 avx512f")
+    set_portable_blas(cpuinfo)
+    assert os.environ["OPENBLAS_CORETYPE"] == "Haswell"
+    monkeypatch.setenv("OPENBLAS_CORETYPE", "Zen")
+    set_portable_blas(cpuinfo)
+    assert os.environ["OPENBLAS_CORETYPE"] == "Zen"
 
 
 @pytest.mark.parametrize(

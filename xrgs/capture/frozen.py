@@ -69,11 +69,13 @@ class Manifest(Struct, frozen=True, forbid_unknown_fields=True):
     files: dict[str, str]
     """The SHA-256 of each file by its path in the folder, with `/`."""
     id: str = ""
+    code: dict[str, str] = {}
+    """The digest of each part of the code that made the variant; empty in older variants."""
 
     def computed_id(self) -> str:
         """Return the key, then a hash of all else that decides a number."""
         content = msgspec.to_builtins(self)
-        hashed = {k: v for k, v in content.items() if k not in ("id", "scene")}
+        hashed = {k: v for k, v in content.items() if k not in ("id", "scene", "code")}
         return f"{self.key}-{digest(hashed)}"
 
 
@@ -81,7 +83,7 @@ class CorruptVariant(XrgsError):  # noqa: N818
     """A frozen variant is damaged or was changed; the message names the file."""
 
 
-def freeze(made: Variant, key: str, folder: Path, variants: Path) -> Variant:
+def freeze(made: Variant, key: str, folder: Path, variants: Path, code: dict[str, str]) -> Variant:
     """Write a variant's fields into the folder of its images, and rename the folder to its id.
 
     All files are on the disk before the folder has its name.
@@ -91,6 +93,7 @@ def freeze(made: Variant, key: str, folder: Path, variants: Path) -> Variant:
         key: The key of what it was made from.
         folder: The folder of its images, on the disk of `variants`.
         variants: The folder that the variant will be in.
+        code: The digest of each part of the code that made it.
 
     Returns:
         The variant, as it is read from its new place.
@@ -106,6 +109,7 @@ def freeze(made: Variant, key: str, folder: Path, variants: Path) -> Variant:
         held_out=made.held_out,
         views=views,
         files=sealed.hashes(folder, [POINTS, *_pictures(views)]),
+        code=code,
     )
     manifest = msgspec.structs.replace(manifest, id=manifest.computed_id())
     write_json(folder / MANIFEST, msgspec.to_builtins(manifest), durable=False)

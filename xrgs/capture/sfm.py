@@ -109,7 +109,8 @@ def reconstruct(
 ) -> Reconstruction:
     """Find cameras and points by exhaustive matching and incremental mapping.
 
-    The result is not reproducible across machines, and not quite between runs: keep it.
+    Every run on one kind of processor gives the same bits, with any number of threads. Another kind
+    gives other last digits.
 
     Args:
         sfm_images: The images; those without `K` get one SIMPLE_RADIAL camera per `camera` name.
@@ -124,9 +125,8 @@ def reconstruct(
     _log_to(work)
     pycolmap.set_random_seed(conf.seed)
     database = work / "database.db"
-    threads = usable_cores()
-    features = _find_matches(sfm_images, folder, work, conf, threads)
-    models = _map(sfm_images, folder, database, work, conf, threads)
+    features = _find_matches(sfm_images, folder, work, conf)
+    models = _map(sfm_images, folder, database, work, conf)
     report = features | {
         "images": len(sfm_images),
         "init_min_tri_angle": conf.init_min_tri_angle,
@@ -177,8 +177,8 @@ def triangulate(
     """
     _log_to(work)
     pycolmap.set_random_seed(conf.seed)
-    database, threads = work / "database.db", usable_cores()
-    features = _find_matches(sfm_images, folder, work, conf, threads)
+    database = work / "database.db"
+    features = _find_matches(sfm_images, folder, work, conf)
     index = {image.file: i for i, image in enumerate(sfm_images)}
     posed = pycolmap.Reconstruction()
     with pycolmap.Database.open(database) as opened:
@@ -188,13 +188,12 @@ def triangulate(
             pose = pycolmap.Rigid3d(viewmats[index[image.name]][:3])
             posed.add_image_with_trivial_frame(image, pose)
     options = mapping_options(conf, len(sfm_images), known=True)
-    options.num_threads = threads
     model = pycolmap.triangulate_points(posed, database, folder, work, options=options)
     return to_numpy(model, index, features)
 
 
 def _find_matches(
-    sfm_images: Sequence[SfmImage], folder: Path, work: Path, conf: SfmConf, threads: int
+    sfm_images: Sequence[SfmImage], folder: Path, work: Path, conf: SfmConf
 ) -> dict[str, Any]:
     """Fill the database in `work`, unless an earlier call has; return the settings of SIFT."""
     database = work / "database.db"
@@ -202,8 +201,9 @@ def _find_matches(
     longest = max(max(images.size(folder / image.file)) for image in sfm_images)
     octave = first_octave(longest, conf.first_octave)
     if not database.exists():
-        _extract(sfm_images, folder, database, max_features, octave, threads)
-        _match(sfm_images, database, work, threads)
+        _name_cameras(sfm_images, folder, database)
+        _extract(sfm_images, folder, database, max_features, octave)
+        _match(sfm_images, database, work, conf.seed)
     return {"first_octave": octave, "max_num_features": max_features}
 
 
@@ -245,65 +245,80 @@ def _log_to(work: Path) -> None:
         log.set_log_destination(level, str(work / f"colmap-{level.name}-"))
 
 
+def _name_cameras(sfm_images: Sequence[SfmImage], folder: Path, database: Path) -> None:
+    """Write images and cameras into a new database, in the order in which they are given.
+
+    Several threads that extract features would number images as they finish, and the numbers
+    decide the order of everything that follows.
+    """
+    with pycolmap.Database.open(database):
+        pass
+    groups: dict[str, list[SfmImage]] = {}
+    for image in sfm_images:
+        groups.setdefault(image.camera, []).append(image)
+    for group in groups.values():
+        first, reader = group[0], pycolmap.ImageReaderOptions()
+        if first.K is not None:
+            reader.camera_model = "PINHOLE"
+            values = (repr(float(first.K[i, j])) for i, j in _PINHOLE_ENTRIES)
+            reader.camera_params = ",".join(values)
+        elif first.focal is not None:
+            width, height = images.size(folder / first.file)
+            reader.camera_params = f"{float(first.focal)},{width / 2},{height / 2},0"
+        pycolmap.import_images(
+            database,
+            folder,
+            camera_mode=pycolmap.CameraMode.SINGLE,
+            image_names=[image.file for image in group],
+            options=reader,
+        )
+
+
 def _extract(
     sfm_images: Sequence[SfmImage],
     folder: Path,
     database: Path,
     max_features: int,
     octave: int,
-    threads: int,
 ) -> None:
+    threads = usable_cores()
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads = threads
     options.sift.max_num_features = max_features
     options.sift.first_octave = octave
-    cameras: dict[str, int] = {}
     with ProgressBar("SfM: features", "view", len(sfm_images)) as bar:
-        for camera, batch in _batches(sfm_images, 2 * threads):
+        for batch in _batches(sfm_images, 2 * threads):
             reader = pycolmap.ImageReaderOptions()
             if batch[0].masked:  # COLMAP drops an image whose mask it does not find
                 reader.mask_path = folder / MASKS
-            if camera in cameras:
-                reader.existing_camera_id = cameras[camera]
-            elif batch[0].K is not None:
-                K = batch[0].K
-                reader.camera_model = "PINHOLE"
-                reader.camera_params = ",".join(repr(float(K[i, j])) for i, j in _PINHOLE_ENTRIES)
-            elif batch[0].focal is not None:
-                width, height = images.size(folder / batch[0].file)
-                reader.camera_params = f"{float(batch[0].focal)},{width / 2},{height / 2},0"
             pycolmap.extract_features(
                 database,
                 folder,
                 image_names=[image.file for image in batch],
-                camera_mode=pycolmap.CameraMode.SINGLE,
                 reader_options=reader,
                 extraction_options=options,
                 device=pycolmap.Device.cpu,
             )
-            with pycolmap.Database.open(database) as opened:
-                newest = max(c.camera_id for c in opened.read_all_cameras())
-            cameras.setdefault(camera, newest)
             bar.update(len(batch))
 
 
-def _batches(sfm_images: Sequence[SfmImage], size: int) -> Iterator[tuple[str, list[SfmImage]]]:
-    """Yield images of one camera, a few at a time, so that progress can be shown in between.
+def _batches(sfm_images: Sequence[SfmImage], size: int) -> Iterator[list[SfmImage]]:
+    """Yield images a few at a time, so that progress can be shown in between.
 
     Either all or none of them have masks.
     """
-    groups: dict[tuple[str, bool], list[SfmImage]] = {}
-    for image in sfm_images:
-        groups.setdefault((image.camera, image.masked), []).append(image)
-    for (camera, _), group in groups.items():
+    for masked in (False, True):
+        group = [image for image in sfm_images if image.masked == masked]
         for start in range(0, len(group), size):
-            yield camera, group[start : start + size]
+            yield group[start : start + size]
 
 
-def _match(sfm_images: Sequence[SfmImage], database: Path, work: Path, threads: int) -> None:
+def _match(sfm_images: Sequence[SfmImage], database: Path, work: Path, seed: int) -> None:
     """Match every pair of images: one image at a time with all that come before it."""
     matching = pycolmap.FeatureMatchingOptions()
-    matching.num_threads = threads
+    matching.num_threads = usable_cores()
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = seed  # for each pair, whichever thread verifies it
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = work / "pairs.txt"
     pairs = len(sfm_images) * (len(sfm_images) - 1) // 2
@@ -315,21 +330,16 @@ def _match(sfm_images: Sequence[SfmImage], database: Path, work: Path, threads: 
                 database,
                 matching_options=matching,
                 pairing_options=pairing,
+                verification_options=verification,
                 device=pycolmap.Device.cpu,
             )
             bar.update(i)
 
 
 def _map(
-    sfm_images: Sequence[SfmImage],
-    folder: Path,
-    database: Path,
-    work: Path,
-    conf: SfmConf,
-    threads: int,
+    sfm_images: Sequence[SfmImage], folder: Path, database: Path, work: Path, conf: SfmConf
 ) -> list[Any]:
     options = mapping_options(conf, len(sfm_images), known=all(s.K is not None for s in sfm_images))
-    options.num_threads = threads
     out = Path(tempfile.mkdtemp(prefix="models-", dir=work))
     with ProgressBar("SfM: cameras", "view", len(sfm_images)) as bar:
         models = pycolmap.incremental_mapping(
@@ -352,6 +362,7 @@ def mapping_options(conf: SfmConf, count: int, *, known: bool) -> Any:
     """
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = conf.seed
+    options.num_threads = 1  # several threads sum a bundle adjustment in another order each time
     options.mapper.init_min_tri_angle = conf.init_min_tri_angle
     options.mapper.abs_pose_min_num_inliers = conf.min_inliers
     options.mapper.init_min_num_inliers = round(conf.min_inliers * _FIRST_PAIR_RATIO)

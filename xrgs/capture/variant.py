@@ -23,17 +23,19 @@ from xrgs.safeio.code import code_digest
 from xrgs.safeio.files import remove_path
 from xrgs.safeio.hashing import digest
 from xrgs.safeio.records import list_folder
+from xrgs.safeio.refactorings import canonical
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from xrgs.config import SceneConf, VariantConf
 
-__all__ = ["CorruptVariant", "build", "failure", "find", "key", "load", "verify"]
+__all__ = ["CorruptVariant", "build", "code", "failure", "find", "key", "load", "verify"]
 
 _log = logging.getLogger(__name__)
 
-#: The source files that decide what every variant is: a change in one of them changes every key.
+#: The source files that decide what every variant is: a change in one of them changes every key,
+#: unless it is declared (`xrgs.safeio.refactorings`).
 CORE = (
     "capture/alignment.py",
     "capture/colour.py",
@@ -78,8 +80,7 @@ def key(scene: SceneConf, conf: VariantConf) -> str:
     settings = _settings(conf)
     if conf.poses is not None:
         settings["poses"] = poses.fingerprint(conf.poses)
-    code = {part: code_digest(*files) for part, files in sources(conf).items()}
-    return digest([scenes.fingerprint(scene, conf.long_side), settings, code])
+    return digest([scenes.fingerprint(scene, conf.long_side), settings, code(conf)])
 
 
 def _settings(conf: VariantConf) -> dict[str, Any]:
@@ -88,6 +89,14 @@ def _settings(conf: VariantConf) -> dict[str, Any]:
     unused = {key for name, way in DEGRADATIONS.items() if name != used for key in way.keys}
     values = {key: value for key, value in identity_values(conf).items() if key not in unused}
     return values | {"degradation": used}
+
+
+def code(conf: VariantConf) -> dict[str, str]:
+    """Return the digest of each part of the code that decides what a variant of this config is."""
+    return {
+        part: canonical(f"variant/{part}", code_digest(*files))
+        for part, files in sources(conf).items()
+    }
 
 
 def sources(conf: VariantConf) -> dict[str, tuple[str, ...]]:
@@ -199,7 +208,7 @@ def _make(scene: scenes.Scene, conf: VariantConf, wanted_key: str, variants: Pat
         folder.mkdir()
     try:
         made = mixing.mix_resolutions(scene, conf, work, frozen)
-        return freeze(made, wanted_key, frozen, variants)
+        return freeze(made, wanted_key, frozen, variants, code(conf))
     except SceneFailed as error:
         write_json(frozen / "report.json", error.report | {"reason": str(error)})
         frozen.rename(failed)

@@ -235,12 +235,13 @@ def prove(cells: Filter, sample: Annotated[int, shown_as("N")] = 2) -> None:
     """Prove that a refactoring changes no number, so that finished cells keep their ids.
 
     Some done cells, which the code before the refactoring has trained, are trained again with the
-    installed code. If all bits are equal, the new code is declared equal to the old one, in
-    xrgs/experiment/refactorings.json of the installed package.
+    installed code, and some variants are built again. If all bits are equal, the new code is
+    declared equal to the old one, in xrgs/safeio/refactorings.json of the installed package.
 
     Args:
         cells: The cells that pass all of these options.
-        sample: Number of cells that are trained again for each part of the code that has changed.
+        sample: Number of cells or variants that are made again for each part of the code that has
+            changed.
     """
     from xrgs.sweep.refactoring import prove as proven
 

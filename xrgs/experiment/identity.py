@@ -20,9 +20,7 @@ part of it.
 
 from __future__ import annotations
 
-import json
 from functools import cache
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -31,6 +29,7 @@ from xrgs.config import identity_values
 from xrgs.experiment.schema import Identity
 from xrgs.safeio.code import code_digest
 from xrgs.safeio.hashing import digest
+from xrgs.safeio.refactorings import canonical
 from xrgs.splat.backend import arithmetic, resolve_backend
 from xrgs.training import plugins
 from xrgs.training.registry import modules_of, order_of
@@ -81,8 +80,6 @@ CORE = (
 #: The C++ sources of the native backend. The compiled module is not hashed: two builds of the same
 #: sources differ in their bytes and give the same numbers.
 NATIVE = ("csrc",)
-#: Declared refactorings: for each part of the code, old digests by the new ones that are equal.
-REFACTORINGS = Path(__file__).with_name("refactorings.json")
 
 
 def cell_identity(conf: Conf, variant_id: str) -> Identity:
@@ -147,22 +144,6 @@ def _files(backend: str, components: tuple[str, ...]) -> dict[str, tuple[str, ..
     if backend == "native":
         files["native"] = NATIVE
     return files | {key: modules_of(key) for key in components if modules_of(key)}
-
-
-def canonical(part: str, code: str) -> str:
-    """Return the oldest digest that a refactoring has declared equal to this digest of a part."""
-    declared = refactorings().get(part, {})
-    while code in declared:
-        code = declared[code]
-    return code
-
-
-def refactorings() -> dict[str, dict[str, str]]:
-    """Return the declared refactorings: old digests by new ones, for each part of the code."""
-    if not REFACTORINGS.is_file():
-        return {}
-    declared: dict[str, dict[str, str]] = json.loads(REFACTORINGS.read_text(encoding="utf-8"))
-    return declared
 
 
 def changed_code(identity: Identity, *, cached: bool = False) -> list[str]:

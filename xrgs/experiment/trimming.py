@@ -4,7 +4,7 @@ A trimmed cell stays done: the files that tables are made of stay, and its `stat
 removed files with their sizes and hashes. A trimmed variant keeps its list of views, cameras,
 points and SfM report, in the folder `variants/trimmed-<id>`. Its cells are still found and
 reported. Before a new cell is trained on it, its images are made again from the photographs. SfM is
-not run again, since another run would give another variant.
+not run again: on another machine it may place the cameras otherwise.
 """
 
 from __future__ import annotations

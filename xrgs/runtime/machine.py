@@ -108,6 +108,19 @@ def set_passive_openmp_wait() -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 
+def set_portable_blas(cpuinfo: Path = Path("/proc/cpuinfo")) -> None:
+    """Make OpenBLAS of child processes, in numpy and pycolmap, compute with AVX2 where there is.
+
+    OpenBLAS has other kernels for processors with AVX-512, whose last digits differ. A value of
+    OPENBLAS_CORETYPE that is already in the environment is kept.
+
+    Args:
+        cpuinfo: Linux's list of what each processor can do. Other systems have none, and are left.
+    """
+    if {"avx2", "fma"} <= set(_words(cpuinfo)):
+        os.environ.setdefault("OPENBLAS_CORETYPE", "Haswell")
+
+
 def set_torch_threads(threads: int) -> int:
     """Set the number of torch's threads, 0 for every usable core; return the number."""
     import torch

@@ -1,9 +1,9 @@
-"""Declares that a refactoring changes no number, after it was proven by training cells again.
+"""Declares that a refactoring changes no number, after it was proven on a sample.
 
-A cell's identity has the digest of each part of the code. Where code was changed so that every
-bit stays the same, a sample of done cells is trained again with the new code. If all bits are
-equal, the new digests are declared equal to the old ones in `xrgs/experiment/refactorings.json`, so
-that all cells keep their ids.
+The ids of cells and of variants have the digest of each part of the code. Where code was changed so
+that every bit stays the same, some done cells are trained again, or some variants are built again,
+with the new code. If all bits are equal, the new digests are declared equal to the old ones
+(`xrgs.safeio.refactorings`), so that everything keeps its id.
 """
 
 from __future__ import annotations
@@ -13,53 +13,73 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from xrgs.errors import XrgsError
+import msgspec
+
+from xrgs.capture import frozen, variant
+from xrgs.errors import StoreError, XrgsError
 from xrgs.experiment import identity
+from xrgs.experiment.store import Store
 from xrgs.runtime.progress import log_line
-from xrgs.safeio.atomic import write_json
+from xrgs.safeio import refactorings
 from xrgs.safeio.sanitize import counted
+from xrgs.sweep import variants
 from xrgs.sweep.rerun import rerun
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from xrgs.experiment.cell_folder import CellFolder
-    from xrgs.experiment.store import Store
-
-#: Name of a part, its old digest and its new one.
-_Change = tuple[str, str, str]
+    from xrgs.safeio.refactorings import Change
 
 
 @dataclass(frozen=True)
 class Proof:
-    """A sample of cells that was trained again to the same bits."""
+    """A sample that was made again to the same bits."""
 
     cells: tuple[str, ...]
+    """Ids of the cells that were trained again."""
+    variants: tuple[str, ...]
+    """Ids of the variants that were built again."""
     parts: tuple[str, ...]
     """The parts of the code whose digests were declared equal."""
 
     def __str__(self) -> str:
-        cells = f"{counted(len(self.cells), 'cell')} trained again, the same bit for bit"
-        return f"{cells}; declared in {identity.REFACTORINGS.name}: {', '.join(self.parts)}"
+        made = []
+        if self.cells:
+            made.append(f"{counted(len(self.cells), 'cell')} trained again")
+        if self.variants:
+            made.append(f"{counted(len(self.variants), 'variant')} built again")
+        parts = ", ".join(self.parts)
+        return f"{', '.join(made)}, the same bit for bit; declared in {_NAME}: {parts}"
+
+
+_NAME = refactorings.FILE.name
 
 
 def prove(store: Store, cells: Sequence[CellFolder], sample: int = 2) -> Proof:
-    """Train cells again with the installed code, and declare it equal where all bits are.
+    """Make cells and variants again with the installed code; declare it equal where all bits are.
 
     Args:
         store: The store that has the cells and their variants.
-        cells: Done cells that the code before the refactoring has trained; others are passed over.
-        sample: Number of cells for each part of the code that has changed; the shortest are taken.
+        cells: Done cells. Those that the installed code has trained, on a variant that it has
+            built, are passed over.
+        sample: Number of cells or variants for each part of the code that has changed; the
+            cells that take the shortest time are taken.
 
     Raises:
-        XrgsError: No done cell was trained with other code than the installed one, cells were
-            trained with several codes, or a number differs; nothing is declared then.
+        XrgsError: Nothing was made with other code than the installed one, cells or variants were
+            made with several codes, or a number differs; nothing is declared then.
     """
-    changes: dict[_Change, list[CellFolder]] = {}
-    for cell in cells:
-        if cell.state(verify=False).name == "done":
-            for change in _changes(cell):
-                changes.setdefault(change, []).append(cell)
+    done = [cell for cell in cells if cell.state(verify=False).name == "done"]
+    done.sort(key=lambda cell: cell.summary().training_time_s)
+    of_cells: dict[Change, list[CellFolder]] = {}
+    of_variants: dict[Change, dict[str, CellFolder]] = {}
+    for cell in done:
+        for change in _changes(cell):
+            of_cells.setdefault(change, []).append(cell)
+        for change in _changes_of_variant(store, cell):
+            of_variants.setdefault(change, {}).setdefault(cell.identity().variant, cell)
+    changes = [*of_cells, *of_variants]
     if not changes:
         raise XrgsError("no done cell was trained with other code than is installed")
     parts = [part for part, _, _ in changes]
@@ -68,18 +88,20 @@ def prove(store: Store, cells: Sequence[CellFolder], sample: int = 2) -> Proof:
             f"cells were trained with several versions of {', '.join(sorted(several))}: name cells"
             " of one version"
         )
-    chosen = {
-        cell.id: cell
-        for of_change in changes.values()
-        for cell in sorted(of_change, key=lambda cell: cell.summary().training_time_s)[:sample]
+    trained = {cell.id: cell for of_one in of_cells.values() for cell in of_one[:sample]}
+    built = {
+        key: cell for of_one in of_variants.values() for key, cell in [*of_one.items()][:sample]
     }
-    for cell in chosen.values():
+    for variant_id, cell in built.items():
+        _build_again(store, variant_id, cell)
+    for cell in trained.values():
         _train_again(store, cell)
-    _declare(list(changes))
-    return Proof(tuple(chosen), tuple(parts))
+    refactorings.declare(changes)
+    identity.training_code.cache_clear()
+    return Proof(tuple(trained), tuple(built), tuple(parts))
 
 
-def _changes(cell: CellFolder) -> list[_Change]:
+def _changes(cell: CellFolder) -> list[Change]:
     """Return the parts of the code that a cell was trained with and that have changed since."""
     trained = cell.identity()
     now, changed = identity.current_code(trained), identity.changed_code(trained)
@@ -90,20 +112,41 @@ def _changes(cell: CellFolder) -> list[_Change]:
     return [(part, trained.code[part], now[part]) for part in changed]
 
 
+def _changes_of_variant(store: Store, cell: CellFolder) -> list[Change]:
+    """Return the parts of the code that a cell's variant was built with and that have changed.
+
+    A variant that is not in the store, or does not say which code has built it, has none.
+    """
+    try:
+        built = frozen.read_manifest(store.variants / cell.identity().variant).code
+    except StoreError:
+        return []
+    now = variant.code(cell.config().variant)
+    return [
+        (f"variant/{part}", built[part], code)
+        for part, code in now.items()
+        if part in built and built[part] != code
+    ]
+
+
+def _build_again(store: Store, variant_id: str, cell: CellFolder) -> None:
+    log_line(f"variant {variant_id}: building again")
+    with tempfile.TemporaryDirectory(prefix="xrgs-") as folder:
+        other = Store(Path(folder) / "store")
+        other.prepare()
+        again = frozen.read_manifest(other.variants / variants.build(cell.config(), other))
+    before = frozen.read_manifest(store.variants / variant_id)
+    then, now = (msgspec.to_builtins(manifest) for manifest in (before, again))
+    different = [
+        name for name in then if name not in {"id", "key", "code"} and then[name] != now[name]
+    ]
+    if different:
+        raise XrgsError(f"{variant_id}: {', '.join(different)} differ; nothing is declared")
+
+
 def _train_again(store: Store, cell: CellFolder) -> None:
     log_line(f"{cell.id}: training again")
     with tempfile.TemporaryDirectory(prefix="xrgs-") as folder:
         result = rerun(cell.path, Path(folder) / cell.id, store.path)
         if result.differences:
             raise XrgsError(f"{cell.id}: {'; '.join(result.differences)}; nothing is declared")
-
-
-def _declare(changes: Sequence[_Change]) -> None:
-    declared = identity.refactorings()
-    for part, old, new in changes:
-        declared.setdefault(part, {})[new] = old
-    try:
-        write_json(identity.REFACTORINGS, declared)
-    except OSError as error:
-        raise XrgsError(f"{identity.REFACTORINGS}: {error.strerror}") from error
-    identity.training_code.cache_clear()

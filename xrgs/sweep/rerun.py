@@ -245,7 +245,7 @@ def _provide(variant_id: str, conf: Conf, store: Store) -> None:
         return
     same_key = built.partition("-")[0] == variant_id.partition("-")[0]
     why = (
-        "the photographs are the same, but COLMAP gives other camera poses each time"
+        "the photographs are the same, but COLMAP gives other camera poses on this machine"
         if same_key
         else "its photographs, or the code that builds it, are not the same"
     )

@@ -60,7 +60,7 @@ def make_variant(store: Store) -> Variant:
     made = Variant(
         "id", folder, "fern", 2, True, tuple(views), points, np.zeros((50, 3), np.uint8), {}
     )
-    return frozen.freeze(made, "0123456789abcdef", folder, store.variants)
+    return frozen.freeze(made, "0123456789abcdef", folder, store.variants, {})
 
 
 def make_gaussians(seed: int, count: int = 200) -> Gaussians:

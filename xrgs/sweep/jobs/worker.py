@@ -23,7 +23,7 @@ import msgspec
 from xrgs.errors import UnreadableError, XrgsError
 from xrgs.experiment.cell_folder import LOG
 from xrgs.runtime import processes
-from xrgs.runtime.machine import set_passive_openmp_wait
+from xrgs.runtime.machine import set_passive_openmp_wait, set_portable_blas
 from xrgs.runtime.signals import StopRequest, StopSignal, end_by_sigterm
 from xrgs.runtime.streams import guard_streams, log_to_stderr, say
 from xrgs.safeio.atomic import write_json
@@ -114,6 +114,7 @@ def run_in_child(
         PassingError: The child could not read a file now.
         WorkerError: The work failed; the message is the reason.
     """
+    set_portable_blas()  # before the child loads it
     try:
         temporary = tempfile.TemporaryDirectory(prefix="xrgs-")
     except FileNotFoundError as error:  # /tmp can't be written, nor any other usual place
