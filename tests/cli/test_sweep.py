@@ -41,7 +41,7 @@ def test_a_sweep_trains_each_cell_once_and_ends_with_the_table(
     arguments = ("+ablation=consistency", "seed=0,1", *SCENE)
     code, out, err = sweep_here(*arguments)
     assert code == 0, err
-    assert "building the mixed-resolution variant" in err
+    assert "motorcycle: building the mixed-resolution variant\n" in err
     assert "plan: 4 cells, 0 done" in err
     assert out == "the table\n"
     assert len(children.trained) == len(set(children.trained)) == 4
@@ -52,6 +52,12 @@ def test_a_sweep_trains_each_cell_once_and_ends_with_the_table(
     record = Store(tmp_path / "s").sweep_record()
     assert [row.label for row in record.cells] == ["baseline", "consistency"] * 2
     assert record.cells[1].baseline_id == record.cells[0].cell_id
+
+
+@pytest.mark.usefixtures("children")
+def test_a_sweep_of_several_variants_says_which_one_is_built(sweep_here: SweepHere) -> None:
+    _, _, err = sweep_here(*SCENE, "variant.factor=2,3")
+    assert "motorcycle: building the mixed-resolution variant 1 of 2\n" in err
 
 
 def test_a_cell_keeps_the_config_and_identity_of_its_plan(

@@ -297,13 +297,15 @@ class Study:
         self, plan: Sequence[PlannedCell], store: Store, *, allow_build: bool
     ) -> list[PlannedCell]:
         """Return the cells with their variants, or with the reasons why there are none."""
-        results: dict[str, variants.PlannedVariant] = {}
+        keys = [digest([to_plain(cell.conf.scene), to_plain(cell.conf.variant)]) for cell in plan]
+        confs = {key: cell.conf for key, cell in zip(keys, plan, strict=True)}
+        results = {}
+        for number, (key, conf) in enumerate(confs.items(), start=1):
+            place = f" {number} of {len(confs)}" if len(confs) > 1 else ""
+            results[key] = variants.plan(conf, store, allow_build=allow_build, place=place)
         said: dict[str, None] = {}
         cells = []
-        for cell in plan:
-            key = digest([to_plain(cell.conf.scene), to_plain(cell.conf.variant)])
-            if key not in results:
-                results[key] = variants.plan(cell.conf, store, allow_build=allow_build)
+        for key, cell in zip(keys, plan, strict=True):
             found = results[key]
             state = CellState("unknown", found.unknown) if found.unknown else CellState("absent")
             cells.append(

@@ -41,12 +41,13 @@ class PlannedVariant:
     """What its report says, or in a dry run what the report of a new variant would say."""
 
 
-def build(conf: Conf, store: Store) -> str:
+def build(conf: Conf, store: Store, place: str = "") -> str:
     """Build the variant of a config in a child process, and return its id.
 
     Args:
         conf: A cell's config, of which only scene and variant are read.
         store: The store to build it in.
+        place: Which of a sweep's variants it is, for the log.
 
     Raises:
         UnwritableError: The disk is full or can't be written.
@@ -55,7 +56,7 @@ def build(conf: Conf, store: Store) -> str:
         XrgsError: The photographs are missing, or can't be made into a variant.
     """
     _check_held_out(scenes.names(conf.scene, conf.variant.long_side), conf)  # SfM takes minutes
-    log_line(f"{scenes.label(conf.scene)}: building the mixed-resolution variant")
+    log_line(f"{scenes.label(conf.scene)}: building the mixed-resolution variant{place}")
     request = {"conf": asdict(conf), "store": str(store.path)}
     answer = worker.run_in_child("variant", request, Limits(), lambda _: store.check_not_gone())
     return str(answer["variant"])
@@ -128,7 +129,7 @@ def find_or_build(conf: Conf, store: Store) -> str:
     return build(conf, store)
 
 
-def plan(conf: Conf, store: Store, *, allow_build: bool) -> PlannedVariant:
+def plan(conf: Conf, store: Store, *, allow_build: bool, place: str = "") -> PlannedVariant:
     """Return a config's variant for a sweep, or the reason why there is none.
 
     A scene that failed before is not tried again, like a failed cell, unless `retry=failed`.
@@ -137,12 +138,13 @@ def plan(conf: Conf, store: Store, *, allow_build: bool) -> PlannedVariant:
         conf: A cell's config.
         store: The store.
         allow_build: Build the variant if the store lacks it; False for a dry run.
+        place: Which of the sweep's variants it is, for the log.
 
     Raises:
         StoreError: The store can't be written, or is no longer there.
     """
     try:
-        return _find_or_build(conf, store, allow_build=allow_build)
+        return _find_or_build(conf, store, allow_build=allow_build, place=place)
     except worker.UnwritableError as error:
         raise StoreError(f"store={store.path}: {error}. {worker.NOTHING_LOST}") from error
     except StoreGoneError:
@@ -156,7 +158,7 @@ def plan(conf: Conf, store: Store, *, allow_build: bool) -> PlannedVariant:
     return PlannedVariant(unknown=f"its variant can't be read now: {reason}")
 
 
-def _find_or_build(conf: Conf, store: Store, *, allow_build: bool) -> PlannedVariant:
+def _find_or_build(conf: Conf, store: Store, *, allow_build: bool, place: str) -> PlannedVariant:
     key = None
     try:
         key = variant.key(conf.scene, conf.variant)
@@ -173,7 +175,7 @@ def _find_or_build(conf: Conf, store: Store, *, allow_build: bool) -> PlannedVar
             return PlannedVariant(error=failure, remembered=True, notes=notes)
         # Not before a build: a header may be of a file that can't be decoded, and is left out.
         if allow_build:
-            built = build(conf, store)
+            built = build(conf, store, place)
             return PlannedVariant(built, notes=_notes(store.variants / built))
         return PlannedVariant(notes=_expected_notes(conf, store))
     except (UnreadableError, worker.UnwritableError, StoreGoneError):
