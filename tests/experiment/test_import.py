@@ -268,7 +268,7 @@ def change_manifest(store: Store, **changes: Any) -> None:
     (name,) = list_names(store.variants)
     file = store.variants / name / "variant.json"
     content = json.loads(file.read_text()) | changes
-    hashed = {k: v for k, v in content.items() if k not in ("id", "scene")}
+    hashed = {k: v for k, v in content.items() if k not in ("id", "scene", "code")}
     content["id"] = f"{content['key']}-{digest(hashed)}"
     write_json(file, content)
     file.parent.rename(store.variants / content["id"])
