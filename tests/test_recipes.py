@@ -159,6 +159,7 @@ def test_a_change_of_a_number_is_not_declared(copy: Copy) -> None:
 def test_a_refactoring_of_the_code_of_variants_is_proven_and_keeps_variants_and_cells(
     copy: Copy,
 ) -> None:
+    before = json.loads((copy.root / "xrgs/safeio/refactorings.json").read_text())
     copy.edit("capture/sfm.py", "_TOTAL_FEATURES = 100_000", "_TOTAL_FEATURES = 100 * 1_000")
     assert "2 cells, 0 done" in done_cells(copy)
     printed = copy.run("store", "prove", "--store", "s")
@@ -167,6 +168,14 @@ def test_a_refactoring_of_the_code_of_variants_is_proven_and_keeps_variants_and_
     assert "declared in refactorings.json: variant/core\n" in printed
     assert len(declared["variant/core"]) == 2
     assert "2 cells, 2 done" in done_cells(copy)
+    # A variant that the refactored code had built before it was declared is of equal code as well.
+    (file,) = (copy.root / "s" / "variants").glob("*/variant.json")
+    (new,) = declared["variant/core"].keys() - before["variant/core"].keys()
+    content = json.loads(file.read_text())
+    content["code"]["core"] = new
+    file.write_text(json.dumps(content))
+    with pytest.raises(AssertionError, match="no done cell was trained with other code"):
+        copy.run("store", "prove", "--store", "s")
 
 
 def test_other_cameras_are_not_declared(copy: Copy) -> None:

@@ -21,6 +21,7 @@ from xrgs.experiment import identity
 from xrgs.experiment.store import Store
 from xrgs.runtime.progress import log_line
 from xrgs.safeio import refactorings
+from xrgs.safeio.refactorings import canonical
 from xrgs.safeio.sanitize import counted
 from xrgs.sweep import variants
 from xrgs.sweep.rerun import rerun
@@ -50,10 +51,8 @@ class Proof:
         if self.variants:
             made.append(f"{counted(len(self.variants), 'variant')} built again")
         parts = ", ".join(self.parts)
-        return f"{', '.join(made)}, the same bit for bit; declared in {_NAME}: {parts}"
-
-
-_NAME = refactorings.FILE.name
+        where = refactorings.FILE.name
+        return f"{', '.join(made)}, the same bit for bit; declared in {where}: {parts}"
 
 
 def prove(store: Store, cells: Sequence[CellFolder], sample: int = 2) -> Proof:
@@ -122,11 +121,8 @@ def _changes_of_variant(store: Store, cell: CellFolder) -> list[Change]:
     except StoreError:
         return []
     now = variant.code(cell.config().variant)
-    return [
-        (f"variant/{part}", built[part], code)
-        for part, code in now.items()
-        if part in built and built[part] != code
-    ]
+    changes = [(f"variant/{part}", built[part], now[part]) for part in now if part in built]
+    return [(part, old, new) for part, old, new in changes if canonical(part, old) != new]
 
 
 def _build_again(store: Store, variant_id: str, cell: CellFolder) -> None:
