@@ -110,7 +110,7 @@ def reconstruct(
     """Find cameras and points by exhaustive matching and incremental mapping.
 
     Every run on one kind of processor gives the same bits, with any number of threads. Another kind
-    gives other last digits.
+    may give other last digits.
 
     Args:
         sfm_images: The images; those without `K` get one SIMPLE_RADIAL camera per `camera` name.

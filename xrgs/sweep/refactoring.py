@@ -80,7 +80,10 @@ def prove(store: Store, cells: Sequence[CellFolder], sample: int = 2) -> Proof:
             of_variants.setdefault(change, {}).setdefault(cell.identity().variant, cell)
     changes = [*of_cells, *of_variants]
     if not changes:
-        raise XrgsError("no done cell was trained with other code than is installed")
+        raise XrgsError(
+            "no done cell was trained with other code than is installed, or on a variant that says"
+            " it was built with other code (variants of earlier versions don't say)"
+        )
     parts = [part for part, _, _ in changes]
     if several := {part for part in parts if parts.count(part) > 1}:
         raise XrgsError(
