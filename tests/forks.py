@@ -17,10 +17,11 @@ import socketserver
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, TextIO
 
 from xrgs.sweep.jobs import supervise
@@ -74,9 +75,10 @@ class _Handler(socketserver.StreamRequestHandler):
             command: Sequence[str],
             limits: supervise.Limits,
             on_poll: Callable[[int], None] = lambda _: None,
+            environment: Mapping[str, str] = MappingProxyType({}),
         ) -> supervise.ProcessEnd:
             job = {"main": WORKER, "arguments": command[-3:], "printed": printed}
-            place = {"folder": str(Path.cwd()), "environment": dict(os.environ)}
+            place = {"folder": str(Path.cwd()), "environment": os.environ | environment}
             answers, child = ask(str(self.server.server_address), **job, **place)
             on_poll(child)
             return supervise.ProcessEnd(exit_code(answers))

@@ -317,7 +317,7 @@ def test_a_variant_that_can_not_be_read_makes_its_cells_unknown_until_it_can(
 ) -> None:
     store, trainer, plan = planned
     found = [variants.PlannedVariant(unknown="its variant can't be read now: points.npz")]
-    monkeypatch.setattr(variants, "plan", lambda *_, **__: found[-1])
+    monkeypatch.setattr(variants, "plan", lambda confs, *_, **__: found[-1:] * len(confs))
     made = study("store=s")
     plan = [replace(cell, variant_id=None, identity=None, cell_id=None) for cell in plan]
     plan = made._identified(made._with_variants(plan, store, allow_build=True), store)
@@ -343,7 +343,7 @@ def test_the_notes_of_a_variant_are_said_once_for_all_of_its_cells(
 ) -> None:
     store, _, plan = planned
     found = variants.PlannedVariant("v", notes=("icon.png left out", "not placed: IMG_1"))
-    monkeypatch.setattr(variants, "plan", lambda *_, **__: found)
+    monkeypatch.setattr(variants, "plan", lambda confs, *_, **__: [found] * len(confs))
     study("store=s")._with_variants(plan, store, allow_build=True)
     scene = scenes.label(plan[0].conf.scene)
     said = f"{scene}: icon.png left out\n{scene}: not placed: IMG_1\n"

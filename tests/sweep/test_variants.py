@@ -6,6 +6,8 @@ import errno
 import os
 import re
 import tempfile
+import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -50,6 +52,11 @@ def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
 
 
+def plan(conf: Conf, store: Store, *, allow_build: bool) -> PlannedVariant:
+    (planned,) = variants.plan([conf], store, allow_build=allow_build)
+    return planned
+
+
 def fail(*_: object) -> dict[str, Any]:
     raise worker.WorkerError("SfM placed too few views")
 
@@ -82,7 +89,7 @@ def test_a_frozen_variant_is_found_and_not_built(
     monkeypatch.setattr(variant, "find", lambda *_: SimpleNamespace(id="k-1"))
     monkeypatch.setattr(worker, "run_in_child", unexpected)
     assert variants.find_or_build(conf, store) == "k-1"
-    assert variants.plan(conf, store, allow_build=True) == reported
+    assert plan(conf, store, allow_build=True) == reported
 
 
 def test_a_trimmed_variant_has_its_notes(
@@ -90,7 +97,7 @@ def test_a_trimmed_variant_has_its_notes(
 ) -> None:
     monkeypatch.setattr(variant, "key", lambda *_: "k")
     (store.variants / "k-1").rename(store.variants / "trimmed-k-1")
-    assert variants.plan(conf, store, allow_build=False) == reported
+    assert plan(conf, store, allow_build=False) == reported
 
 
 def test_a_report_that_is_damaged_is_named(
@@ -98,7 +105,7 @@ def test_a_report_that_is_damaged_is_named(
 ) -> None:
     monkeypatch.setattr(variant, "find", lambda *_: SimpleNamespace(id="k-1"))
     (store.variants / "k-1" / "report.json").write_text('{"notes": 3}')
-    (note,) = variants.plan(conf, store, allow_build=True).notes
+    (note,) = plan(conf, store, allow_build=True).notes
     assert "k-1/report.json" in note
 
 
@@ -112,9 +119,9 @@ def test_a_variant_that_the_store_lacks_is_built_in_a_child(
         return {"variant": "k-1"}
 
     monkeypatch.setattr(worker, "run_in_child", build)
-    assert variants.plan(conf, store, allow_build=False) == PlannedVariant()
+    assert plan(conf, store, allow_build=False) == PlannedVariant()
     assert not requests
-    assert variants.plan(conf, store, allow_build=True) == reported
+    assert plan(conf, store, allow_build=True) == reported
     assert variants.find_or_build(conf, store) == "k-1"
     assert requests == [("variant", "motorcycle", str(store.path))] * 2
 
@@ -125,21 +132,19 @@ def test_a_scene_that_failed_is_not_tried_again_unless_asked(
     remember_failure(conf, store)
     monkeypatch.setattr(worker, "run_in_child", unexpected)
     failed_before = PlannedVariant(error="no first pair", remembered=True)
-    assert variants.plan(conf, store, allow_build=True) == failed_before
+    assert plan(conf, store, allow_build=True) == failed_before
     conf.retry = "failed"
-    assert variants.plan(conf, store, allow_build=False) == PlannedVariant()
+    assert plan(conf, store, allow_build=False) == PlannedVariant()
     monkeypatch.setattr(worker, "run_in_child", fail)
     # The reason is the remembered one, so that the record of a repeated sweep is the same.
-    assert variants.plan(conf, store, allow_build=True) == failed_before
+    assert plan(conf, store, allow_build=True) == failed_before
 
 
 def test_a_failure_is_the_reason_in_the_plan_and_an_error_elsewhere(
     conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(worker, "run_in_child", fail)
-    assert variants.plan(conf, store, allow_build=True) == PlannedVariant(
-        error="SfM placed too few views"
-    )
+    assert plan(conf, store, allow_build=True) == PlannedVariant(error="SfM placed too few views")
     with pytest.raises(XrgsError, match="SfM placed too few views"):
         variants.find_or_build(conf, store)
 
@@ -156,7 +161,7 @@ def test_a_library_that_dies_of_a_full_disk_is_not_a_failure_of_the_scene(
 
     monkeypatch.setattr(worker, "run_in_child", dies)
     with pytest.raises(StoreError, match="No space left"):
-        variants.plan(conf, store, allow_build=True)
+        plan(conf, store, allow_build=True)
 
 
 def test_a_child_that_can_not_write_stops_the_sweep(
@@ -167,7 +172,7 @@ def test_a_child_that_can_not_write_stops_the_sweep(
 
     monkeypatch.setattr(worker, "run_in_child", unwritable)
     with pytest.raises(StoreError, match=r"No space left.*Finished cells are kept"):
-        variants.plan(conf, store, allow_build=True)
+        plan(conf, store, allow_build=True)
 
 
 @pytest.mark.parametrize("number", [errno.EACCES, errno.EIO, errno.ESTALE])
@@ -183,7 +188,7 @@ def test_a_variant_that_can_not_be_read_now_is_not_built_anew(
     (frozen / "variant.json").write_text("{}")
     monkeypatch.setattr(worker, "run_in_child", unexpected)
     sick("variant.json", number)
-    found = variants.plan(conf, store, allow_build=True)
+    found = plan(conf, store, allow_build=True)
     assert found == PlannedVariant(unknown=found.unknown)
     assert f"{frozen}/variant.json: {os.strerror(number)}" in str(found.unknown)
     assert [path.name for path in frozen.iterdir()] == ["variant.json"]
@@ -197,7 +202,7 @@ def test_a_folder_of_variants_that_can_not_be_listed_is_unknown(
 
     monkeypatch.setattr(Path, "iterdir", fail)
     monkeypatch.setattr(worker, "run_in_child", unexpected)
-    assert "Permission denied" in str(variants.plan(conf, store, allow_build=True).unknown)
+    assert "Permission denied" in str(plan(conf, store, allow_build=True).unknown)
 
 
 def test_a_child_that_can_not_read_a_file_now_fails_no_scene(
@@ -207,7 +212,7 @@ def test_a_child_that_can_not_read_a_file_now_fails_no_scene(
         raise worker.PassingError("Stale file handle")
 
     monkeypatch.setattr(worker, "run_in_child", stale)
-    found = variants.plan(conf, store, allow_build=True)
+    found = plan(conf, store, allow_build=True)
     assert "Stale file handle" in str(found.unknown)
     assert found.error is None
 
@@ -216,7 +221,9 @@ def test_a_child_that_can_not_read_a_file_now_fails_no_scene(
 def test_a_store_that_vanishes_while_a_variant_is_built_does_not_reappear(
     conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch, seen: str
 ) -> None:
-    def build(_: str, __: object, ___: object, on_poll: Callable[[int], None]) -> dict[str, Any]:
+    def build(
+        _: str, __: object, ___: object, on_poll: Callable[[int], None], ____: object
+    ) -> dict[str, Any]:
         on_poll(0)
         store.path.rename(store.path.with_name("moved"))
         if seen == "by its parent":
@@ -225,8 +232,82 @@ def test_a_store_that_vanishes_while_a_variant_is_built_does_not_reappear(
 
     monkeypatch.setattr(worker, "run_in_child", build)
     with pytest.raises(StoreGoneError, match="no longer there"):
-        variants.plan(conf, store, allow_build=True)
+        plan(conf, store, allow_build=True)
     assert not store.path.exists()
+
+
+def two(compose: Callable[..., Conf]) -> list[Conf]:
+    """Configs of two variants of a scene."""
+    return [compose("scene=motorcycle", f"variant.factor={factor}") for factor in (2, 3)]
+
+
+def test_variants_are_built_at_once_on_shares_of_the_cores(
+    compose: Callable[..., Conf],
+    store: Store,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    both = threading.Barrier(2, timeout=30)
+    environments = []
+
+    def build(_: str, request: dict[str, Any], *rest: Any) -> dict[str, Any]:
+        environments.append(rest[-1])
+        both.wait()  # a second build that began after the end of the first would break it
+        return {"variant": f"k-{request['conf']['variant']['factor']}"}
+
+    monkeypatch.setattr(variants, "usable_cores", lambda: 5)
+    monkeypatch.setattr(worker, "run_in_child", build)
+    planned = variants.plan(two(compose), store, allow_build=True)
+    assert [found.id for found in planned] == ["k-2", "k-3"]
+    assert environments == [{"PYTHON_CPU_COUNT": "2", "TQDM_DISABLE": "1"}] * 2
+    lines = sorted(capfd.readouterr().err.splitlines())
+    assert lines == [f"motorcycle: {BUILDING} {place} of 2" for place in (1, 2)]
+
+
+@pytest.mark.parametrize("lacking", ["cores", "memory"])
+def test_as_many_are_built_at_once_as_there_is_room_for(
+    compose: Callable[..., Conf], store: Store, monkeypatch: pytest.MonkeyPatch, lacking: str
+) -> None:
+    building = threading.Lock()
+
+    def build(*arguments: Any) -> dict[str, Any]:
+        assert "TQDM_DISABLE" not in arguments[-1]
+        assert building.acquire(blocking=False)
+        time.sleep(0.05)
+        building.release()
+        return {"variant": "k-1"}
+
+    monkeypatch.setattr(variants, "usable_cores", lambda: 1 if lacking == "cores" else 8)
+    monkeypatch.setattr(variants, "usable_memory", lambda: 1 if lacking == "memory" else 1 << 40)
+    monkeypatch.setattr(worker, "run_in_child", build)
+    planned = variants.plan(two(compose), store, allow_build=True)
+    assert [found.id for found in planned] == ["k-1", "k-1"]
+
+
+def test_a_build_that_stops_the_sweep_ends_the_others(
+    compose: Callable[..., Conf], store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ended = []
+
+    def build(
+        _: str, request: dict[str, Any], __: object, on_poll: Callable[[int], None], ___: object
+    ) -> dict[str, Any]:
+        if request["conf"]["variant"]["factor"] == 2:
+            raise worker.UnwritableError("No space left on device")
+        end = time.monotonic() + 30
+        try:
+            while time.monotonic() < end:
+                on_poll(0)
+        except worker.InterruptedWorkError:
+            ended.append(3)
+            raise
+        return {"variant": "k-3"}
+
+    monkeypatch.setattr(variants, "usable_cores", lambda: 2)
+    monkeypatch.setattr(worker, "run_in_child", build)
+    with pytest.raises(StoreError, match="No space left"):
+        variants.plan(two(compose), store, allow_build=True)
+    assert ended == [3]
 
 
 @pytest.mark.slow
@@ -280,7 +361,7 @@ def test_a_dry_run_reads_the_headers_of_photographs(
     scene = photographs(tmp_path / "scene", readable)
     (scene / "x.jpg").write_bytes(b"xx")
     conf = compose("scene=folder", f"scene.path={scene}")
-    planned = variants.plan(conf, store, allow_build=False)
+    planned = plan(conf, store, allow_build=False)
     if readable == 4:
         (note,) = planned.notes
         assert note.startswith("left out: x.jpg (unreadable or truncated image")
@@ -329,7 +410,7 @@ def test_a_plan_says_what_no_variant_can_be_made_of(
 ) -> None:
     scene = photographs(tmp_path / "scene", count, size)
     conf = compose("scene=folder", f"scene.path={scene}", *changes)
-    planned = variants.plan(conf, store, allow_build=False)
+    planned = plan(conf, store, allow_build=False)
     assert re.search(re.sub(r"[()]", r"\\\g<0>", error), planned.error or "")
     with pytest.raises(XrgsError):  # the build says the same, or asks more of SfM
         variant.build(conf.scene, conf.variant, store.variants, store.scenes)
@@ -340,23 +421,23 @@ def test_photographs_of_which_too_few_are_trained_on_are_refused_before_sfm(
 ) -> None:
     conf = compose("scene=folder", f"scene.path={photographs(tmp_path / 'scene', 2)}")
     monkeypatch.setattr(worker, "run_in_child", unexpected)
-    planned = variants.plan(conf, store, allow_build=True)
+    planned = plan(conf, store, allow_build=True)
     assert "1 of 2 photographs is held out: variant.test_every=0" in str(planned.error)
     assert not planned.remembered
     monkeypatch.setattr(worker, "run_in_child", fail)  # with every photograph, SfM is tried
     conf.variant.test_every = 0
-    assert variants.plan(conf, store, allow_build=True).error == "SfM placed too few views"
+    assert plan(conf, store, allow_build=True).error == "SfM placed too few views"
 
 
 def test_a_plan_says_that_no_view_is_lr(
     compose: Callable[..., Conf], store: Store, tmp_path: Path
 ) -> None:
     conf = compose("scene=folder", f"scene.path={photographs(tmp_path / 'scene', 3)}")
-    assert variants.plan(conf, store, allow_build=False).notes == (
+    assert plan(conf, store, allow_build=False).notes == (
         "no LR view: 2 training photographs are all HR by variant.min_hr=2; nothing is mixed",
     )
     conf.variant.hr_fraction = 1.0  # asked for
-    assert variants.plan(conf, store, allow_build=False).notes == ()
+    assert plan(conf, store, allow_build=False).notes == ()
 
 
 def test_a_variant_that_is_found_says_what_the_folder_has_got_since(
@@ -372,7 +453,7 @@ def test_a_variant_that_is_found_says_what_the_folder_has_got_since(
         (scene / "store" / name).mkdir()
     monkeypatch.setattr(variant, "find", lambda *_: SimpleNamespace(id="k-1"))
     conf = compose("scene=folder", f"scene.path={scene}/**")
-    notes = variants.plan(conf, store, allow_build=True).notes
+    notes = plan(conf, store, allow_build=True).notes
     assert notes == ("images left out: 1 in store (a store of xrgs)", *reported.notes)
 
 

@@ -299,10 +299,8 @@ class Study:
         """Return the cells with their variants, or with the reasons why there are none."""
         keys = [digest([to_plain(cell.conf.scene), to_plain(cell.conf.variant)]) for cell in plan]
         confs = {key: cell.conf for key, cell in zip(keys, plan, strict=True)}
-        results = {}
-        for number, (key, conf) in enumerate(confs.items(), start=1):
-            place = f" {number} of {len(confs)}" if len(confs) > 1 else ""
-            results[key] = variants.plan(conf, store, allow_build=allow_build, place=place)
+        made = variants.plan([*confs.values()], store, allow_build=allow_build)
+        results = dict(zip(confs, made, strict=True))
         said: dict[str, None] = {}
         cells = []
         for key, cell in zip(keys, plan, strict=True):

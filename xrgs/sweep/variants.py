@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import shlex
+import threading
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from xrgs.capture import photographs, scenes, split, variant
 from xrgs.capture.description import read_report
@@ -14,16 +17,21 @@ from xrgs.config import CONF_DIR
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.experiment import trimming
 from xrgs.experiment.store import StoreGoneError
+from xrgs.runtime.machine import usable_cores, usable_memory
 from xrgs.runtime.progress import log_line
 from xrgs.safeio.files import is_transient
 from xrgs.sweep.jobs import worker
 from xrgs.sweep.jobs.supervise import Limits
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from xrgs.config import Conf, SceneConf
     from xrgs.experiment.store import Store
+
+_Result = TypeVar("_Result")
+#: Memory that a build may take; fern and flower take 0.6 GB each at 500 px.
+_BUILD_BYTES = 2 << 30
 
 
 @dataclass(frozen=True)
@@ -41,13 +49,12 @@ class PlannedVariant:
     """What its report says, or in a dry run what the report of a new variant would say."""
 
 
-def build(conf: Conf, store: Store, place: str = "") -> str:
+def build(conf: Conf, store: Store) -> str:
     """Build the variant of a config in a child process, and return its id.
 
     Args:
         conf: A cell's config, of which only scene and variant are read.
         store: The store to build it in.
-        place: Which of a sweep's variants it is, for the log.
 
     Raises:
         UnwritableError: The disk is full or can't be written.
@@ -55,10 +62,17 @@ def build(conf: Conf, store: Store, place: str = "") -> str:
         StoreGoneError: The store is no longer there.
         XrgsError: The photographs are missing, or can't be made into a variant.
     """
+    log_line(f"{scenes.label(conf.scene)}: building the mixed-resolution variant")
+    return _build(conf, store, store.check_not_gone, {})
+
+
+def _build(
+    conf: Conf, store: Store, check: Callable[[], None], environment: Mapping[str, str]
+) -> str:
+    """Build a variant; an exception that `check` raises meanwhile ends the child."""
     _check_held_out(scenes.names(conf.scene, conf.variant.long_side), conf)  # SfM takes minutes
-    log_line(f"{scenes.label(conf.scene)}: building the mixed-resolution variant{place}")
     request = {"conf": asdict(conf), "store": str(store.path)}
-    answer = worker.run_in_child("variant", request, Limits(), lambda _: store.check_not_gone())
+    answer = worker.run_in_child("variant", request, Limits(), lambda _: check(), environment)
     return str(answer["variant"])
 
 
@@ -129,22 +143,109 @@ def find_or_build(conf: Conf, store: Store) -> str:
     return build(conf, store)
 
 
-def plan(conf: Conf, store: Store, *, allow_build: bool, place: str = "") -> PlannedVariant:
-    """Return a config's variant for a sweep, or the reason why there is none.
+def plan(confs: Sequence[Conf], store: Store, *, allow_build: bool) -> list[PlannedVariant]:
+    """Return the variants of configs for a sweep, or the reasons why there are none.
 
-    A scene that failed before is not tried again, like a failed cell, unless `retry=failed`.
+    The variants that the store lacks are built, several at once. A scene that failed before is not
+    tried again, like a failed cell, unless `retry=failed`.
 
     Args:
-        conf: A cell's config.
+        confs: Configs of cells, one for each variant.
         store: The store.
-        allow_build: Build the variant if the store lacks it; False for a dry run.
-        place: Which of the sweep's variants it is, for the log.
+        allow_build: Build the variants that the store lacks; False for a dry run.
+
+    Raises:
+        StoreError: The store can't be written, or is no longer there.
+    """
+    known = [_outcome(_known, conf, store) for conf in confs]
+    lacking = {i: confs[i] for i, found in enumerate(known) if found is None}
+    if allow_build:
+        made = _build_all(lacking, len(confs), store)
+    else:  # not before a build: a header may be of a file that can't be decoded, and is left out
+        made = {i: _outcome(_expected, conf, store) for i, conf in lacking.items()}
+    return [found or made[i] for i, found in enumerate(known)]
+
+
+def _known(conf: Conf, store: Store) -> PlannedVariant | None:
+    """Return what the store knows of a config's variant; None where it is to be built."""
+    key = variant.key(conf.scene, conf.variant)
+    frozen = variant.find(store.variants, key)
+    if frozen is not None:
+        return _found(conf, store, frozen.id, store.variants / frozen.id)
+    # The done cells of a trimmed variant are found by its id; a job that trains another cell makes
+    # the images again.
+    if trimmed := trimming.trimmed_variant(store.variants, key):
+        return _found(conf, store, trimmed, trimmed_folder(store.variants, trimmed))
+    return None if conf.retry == "failed" else _failed_before(store, key)
+
+
+def _expected(conf: Conf, store: Store) -> PlannedVariant:
+    """Return a variant that a dry run does not build, with the notes that it would have."""
+    return PlannedVariant(notes=_expected_notes(conf, store))
+
+
+def _build_all(lacking: Mapping[int, Conf], total: int, store: Store) -> dict[int, PlannedVariant]:
+    """Build variants, several at once.
+
+    COLMAP finds the cameras of a scene on one core: a single build would leave the others idle.
+
+    Args:
+        lacking: Configs by their place among all variants of the sweep.
+        total: How many these are.
+        store: The store.
+    """
+    cores = usable_cores()
+    at_once = max(1, min(len(lacking), cores, usable_memory() // _BUILD_BYTES))
+    environment = {"PYTHON_CPU_COUNT": str(cores // at_once)}
+    if at_once > 1:
+        environment["TQDM_DISABLE"] = "1"  # the bars of several builds would overwrite each other
+    ended = threading.Event()
+
+    def check() -> None:
+        store.check_not_gone()
+        if ended.is_set():
+            raise worker.InterruptedWorkError("the sweep has ended")
+
+    def build_one(place: int, conf: Conf, store: Store) -> PlannedVariant:
+        of = f" {place + 1} of {total}" if total > 1 else ""
+        log_line(f"{scenes.label(conf.scene)}: building the mixed-resolution variant{of}")
+        built = _build(conf, store, check, environment)
+        return PlannedVariant(built, notes=_notes(store.variants / built))
+
+    with ThreadPoolExecutor(at_once) as pool:
+        builds = {
+            i: pool.submit(_outcome, partial(build_one, i), conf, store, building=True)
+            for i, conf in lacking.items()
+        }
+        try:
+            for build in as_completed(builds.values()):
+                build.result()
+        finally:  # an error or a signal ends the other builds
+            ended.set()
+            pool.shutdown(cancel_futures=True)
+    return {i: build.result() for i, build in builds.items()}
+
+
+def _outcome(
+    work: Callable[[Conf, Store], _Result], conf: Conf, store: Store, *, building: bool = False
+) -> _Result | PlannedVariant:
+    """Return what `work` returns for a config, or the reason why the scene has no variant.
 
     Raises:
         StoreError: The store can't be written, or is no longer there.
     """
     try:
-        return _find_or_build(conf, store, allow_build=allow_build, place=place)
+        try:
+            return work(conf, store)
+        except (UnreadableError, worker.UnwritableError, StoreGoneError):
+            raise
+        except XrgsError as error:
+            if building:
+                store.check_not_gone()
+                # COLMAP dies of a full disk without saying so. The scene is not at fault then.
+                store.check_room()
+            # The reason that the store keeps: a sweep that is planned again has the same record.
+            return _failure(conf, store) or PlannedVariant(error=str(error))
     except worker.UnwritableError as error:
         raise StoreError(f"store={store.path}: {error}. {worker.NOTHING_LOST}") from error
     except StoreGoneError:
@@ -158,39 +259,23 @@ def plan(conf: Conf, store: Store, *, allow_build: bool, place: str = "") -> Pla
     return PlannedVariant(unknown=f"its variant can't be read now: {reason}")
 
 
-def _find_or_build(conf: Conf, store: Store, *, allow_build: bool, place: str) -> PlannedVariant:
-    key = None
+def _failure(conf: Conf, store: Store) -> PlannedVariant | None:
     try:
         key = variant.key(conf.scene, conf.variant)
-        frozen = variant.find(store.variants, key)
-        if frozen is not None:
-            return _found(conf, store, frozen.id, store.variants / frozen.id)
-        # The done cells of a trimmed variant are found by its id; a job that trains another cell
-        # makes the images again.
-        if trimmed := trimming.trimmed_variant(store.variants, key):
-            return _found(conf, store, trimmed, trimmed_folder(store.variants, trimmed))
-        failure = None if conf.retry == "failed" else variant.failure(store.variants, key)
-        if failure:
-            notes = _notes(failed_folder(store.variants, key))
-            return PlannedVariant(error=failure, remembered=True, notes=notes)
-        # Not before a build: a header may be of a file that can't be decoded, and is left out.
-        if allow_build:
-            built = build(conf, store, place)
-            return PlannedVariant(built, notes=_notes(store.variants / built))
-        return PlannedVariant(notes=_expected_notes(conf, store))
-    except (UnreadableError, worker.UnwritableError, StoreGoneError):
+    except UnreadableError:
         raise
-    except XrgsError as error:
-        if allow_build:
-            store.check_not_gone()
-            # COLMAP dies of a full disk without saying so. The scene is not at fault then.
-            store.check_room()
-        # The reason that the store keeps: a sweep that is planned again has the same record then.
-        remembered = variant.failure(store.variants, key) if key else None
-        notes = _notes(failed_folder(store.variants, key)) if key and remembered else ()
-        return PlannedVariant(
-            error=remembered or str(error), remembered=remembered is not None, notes=notes
-        )
+    except XrgsError:  # the photographs are not there
+        return None
+    return _failed_before(store, key)
+
+
+def _failed_before(store: Store, key: str) -> PlannedVariant | None:
+    """Return the failure of a scene that the store keeps; None where there is none."""
+    failure = variant.failure(store.variants, key)
+    if not failure:
+        return None
+    notes = _notes(failed_folder(store.variants, key))
+    return PlannedVariant(error=failure, remembered=True, notes=notes)
 
 
 def _found(conf: Conf, store: Store, variant_id: str, folder: Path) -> PlannedVariant:

@@ -8,13 +8,14 @@ import subprocess
 import time
 from contextlib import suppress
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from xrgs.runtime import processes
 from xrgs.runtime.progress import log_line
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
 #: Seconds between two polls of the child.
 _POLL_S = 0.2
@@ -52,7 +53,10 @@ class ProcessEnd:
 
 
 def run_supervised(
-    command: Sequence[str], limits: Limits, on_poll: Callable[[int], None] = lambda _: None
+    command: Sequence[str],
+    limits: Limits,
+    on_poll: Callable[[int], None] = lambda _: None,
+    environment: Mapping[str, str] = MappingProxyType({}),
 ) -> ProcessEnd:
     """Run a command, in a session of its own, until it ends or exceeds a limit.
 
@@ -63,8 +67,11 @@ def run_supervised(
         limits: The process and its children are ended when they exceed them.
         on_poll: Called repeatedly while the process runs, with its process id. An exception that
             it raises ends the process and is raised here.
+        environment: Variables that the process has besides those of this process.
     """
-    child = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)  # noqa: S603
+    child = subprocess.Popen(  # noqa: S603
+        command, stdin=subprocess.PIPE, start_new_session=True, env=os.environ | environment
+    )
     reason = ""
     try:
         reason = _watch(child, limits, on_poll)

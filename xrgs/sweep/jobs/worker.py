@@ -16,6 +16,7 @@ import sys
 import tempfile
 import traceback
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -93,6 +94,7 @@ def run_in_child(
     request: Mapping[str, Any],
     limits: supervise.Limits = _NO_LIMITS,
     on_poll: Callable[[int], None] = lambda _: None,
+    environment: Mapping[str, str] = MappingProxyType({}),
 ) -> dict[str, Any]:
     """Do one piece of work in a child process and return its answer.
 
@@ -103,6 +105,7 @@ def run_in_child(
         limits: The child is ended when it exceeds them.
         on_poll: Called repeatedly while the child runs, with its process id. An exception that it
             raises ends the child and is raised here.
+        environment: Variables that the child has besides those of this process.
 
     Returns:
         The answer of the work, as plain JSON values.
@@ -126,7 +129,7 @@ def run_in_child(
         # -P keeps the working folder off sys.path: the child imports the package its parent did.
         child = [sys.executable, "-P", "-m", "xrgs.sweep.jobs.worker"]
         command = [*child, job, str(request_file), str(answer_file)]
-        ended = supervise.run_supervised(command, limits, on_poll)
+        ended = supervise.run_supervised(command, limits, on_poll, environment)
         if ended.reason:
             raise WorkerError(ended.reason)
         if not answer_file.exists() and ended.code == os.EX_IOERR:
