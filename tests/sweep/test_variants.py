@@ -287,11 +287,12 @@ def test_as_many_are_built_at_once_as_there_is_room_for(
 def test_a_build_that_stops_the_sweep_ends_the_others(
     compose: Callable[..., Conf], store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    ended = []
+    both, ended = threading.Barrier(2, timeout=30), []
 
     def build(
         _: str, request: dict[str, Any], __: object, on_poll: Callable[[int], None], ___: object
     ) -> dict[str, Any]:
+        both.wait()
         if request["conf"]["variant"]["factor"] == 2:
             raise worker.UnwritableError("No space left on device")
         end = time.monotonic() + 30

@@ -235,17 +235,7 @@ def _outcome(
         StoreError: The store can't be written, or is no longer there.
     """
     try:
-        try:
-            return work(conf, store)
-        except (UnreadableError, worker.UnwritableError, StoreGoneError):
-            raise
-        except XrgsError as error:
-            if building:
-                store.check_not_gone()
-                # COLMAP dies of a full disk without saying so. The scene is not at fault then.
-                store.check_room()
-            # The reason that the store keeps: a sweep that is planned again has the same record.
-            return _failure(conf, store) or PlannedVariant(error=str(error))
+        return work(conf, store)
     except worker.UnwritableError as error:
         raise StoreError(f"store={store.path}: {error}. {worker.NOTHING_LOST}") from error
     except StoreGoneError:
@@ -256,17 +246,21 @@ def _outcome(
         if not is_transient(error):
             raise
         reason = str(error)
+    except XrgsError as error:
+        if building:
+            store.check_not_gone()
+            # COLMAP dies of a full disk without saying so. The scene is not at fault then.
+            store.check_room()
+        # The reason that the store keeps: a sweep that is planned again has the same record then.
+        return _failure(conf, store) or PlannedVariant(error=str(error))
     return PlannedVariant(unknown=f"its variant can't be read now: {reason}")
 
 
 def _failure(conf: Conf, store: Store) -> PlannedVariant | None:
     try:
-        key = variant.key(conf.scene, conf.variant)
-    except UnreadableError:
-        raise
-    except XrgsError:  # the photographs are not there
+        return _failed_before(store, variant.key(conf.scene, conf.variant))
+    except XrgsError:  # the photographs are not there, or the reason can't be read now
         return None
-    return _failed_before(store, key)
 
 
 def _failed_before(store: Store, key: str) -> PlannedVariant | None:
