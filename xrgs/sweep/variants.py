@@ -62,15 +62,22 @@ def build(conf: Conf, store: Store) -> str:
         StoreGoneError: The store is no longer there.
         XrgsError: The photographs are missing, or can't be made into a variant.
     """
-    log_line(f"{scenes.label(conf.scene)}: building the mixed-resolution variant")
-    return _build(conf, store, store.check_not_gone, {})
+    return _build(conf, store, "", store.check_not_gone, {})
 
 
 def _build(
-    conf: Conf, store: Store, check: Callable[[], None], environment: Mapping[str, str]
+    conf: Conf,
+    store: Store,
+    place: str,
+    check: Callable[[], None],
+    environment: Mapping[str, str],
 ) -> str:
-    """Build a variant; an exception that `check` raises meanwhile ends the child."""
+    """Build a variant, and say its place among several.
+
+    An exception that `check` raises meanwhile ends the child.
+    """
     _check_held_out(scenes.names(conf.scene, conf.variant.long_side), conf)  # SfM takes minutes
+    log_line(f"{scenes.label(conf.scene)}: building the mixed-resolution variant{place}")
     request = {"conf": asdict(conf), "store": str(store.path)}
     answer = worker.run_in_child("variant", request, Limits(), lambda _: check(), environment)
     return str(answer["variant"])
@@ -206,10 +213,9 @@ def _build_all(lacking: Mapping[int, Conf], total: int, store: Store) -> dict[in
         if ended.is_set():
             raise worker.InterruptedWorkError("the sweep has ended")
 
-    def build_one(place: int, conf: Conf, store: Store) -> PlannedVariant:
-        of = f" {place + 1} of {total}" if total > 1 else ""
-        log_line(f"{scenes.label(conf.scene)}: building the mixed-resolution variant{of}")
-        built = _build(conf, store, check, environment)
+    def build_one(i: int, conf: Conf, store: Store) -> PlannedVariant:
+        place = f" {i + 1} of {total}" if total > 1 else ""
+        built = _build(conf, store, place, check, environment)
         return PlannedVariant(built, notes=_notes(store.variants / built))
 
     with ThreadPoolExecutor(at_once) as pool:
