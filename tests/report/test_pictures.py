@@ -24,8 +24,8 @@ def add_weights(made: Any, scenes: tuple[str, ...] = ("fern", "room"), values: A
             made.add(label, scene=scene, values={"psnr": psnr, "gaussians": 200})
 
 
-def found(made: Any, condition: str = "") -> dict[str, Any]:
-    return sensitivities(compare(made.read().cells, METRICS), condition)
+def found(made: Any) -> dict[str, Any]:
+    return sensitivities(compare(made.read().cells, METRICS))
 
 
 def test_changes_are_in_the_order_of_the_values_at_each_level(made: Any) -> None:
@@ -82,9 +82,23 @@ def test_names_and_fewer_than_three_values_are_no_curve(made: Any, labels: tuple
     assert found(made) == {}
 
 
-def test_the_other_condition_has_its_own_changes(made: Any) -> None:
-    add_weights(made)
-    assert found(made, "train.steps=5") == {}
+def test_a_swept_condition_is_a_setting_of_each_ablation(made: Any) -> None:
+    for factor in (2, 3, 8):
+        for share in (0.1, 0.5):
+            condition = f"variant.factor={factor} variant.hr_fraction={share}"
+            changes = {"baseline": 0.0, "plus": factor, "lean": share}
+            for label, change in changes.items():
+                made.add(label, condition=condition, values={"psnr": 20.0 + change})
+    ((key, rows),) = found(made).items()
+    assert key == "variant.factor"  # hr_fraction has two values
+    means = rows[(rows["level"] == "mean") & (rows["metric"] == "psnr")]
+    curves = {name: list(curve["change"]) for name, curve in means.groupby("series")}
+    assert curves == {
+        "lean variant.hr_fraction=0.1": pytest.approx([0.1] * 3),
+        "lean variant.hr_fraction=0.5": pytest.approx([0.5] * 3),
+        "plus variant.hr_fraction=0.1": pytest.approx([2, 3, 8]),
+        "plus variant.hr_fraction=0.5": pytest.approx([2, 3, 8]),
+    }
 
 
 def test_a_value_that_failed_is_left_out(made: Any) -> None:
@@ -103,11 +117,26 @@ def test_the_report_has_the_figure_where_there_are_three_values(made: Any, tmp_p
     assert "Change from baseline over consistency.weight" in (folder / "table.md").read_text()
 
 
-def test_more_curves_than_colours_are_not_drawn_and_said(made: Any, tmp_path: Path) -> None:
-    made.add()
-    for other in range(8):
+def test_of_more_curves_than_colours_each_ablation_has_its_own_figure(
+    made: Any, tmp_path: Path
+) -> None:
+    for other in range(4):
         for value in (1, 2, 3):
-            made.add(f"a.b={value} c.d=x{other}")
+            for label in ("baseline", "plus", "lean"):
+                made.add(label, condition=f"a.b={value} c.d=x{other}")
+    made.write()
+    names = ["sensitivity-a.b.lean", "sensitivity-a.b.plus"]
+    page = build(made.store.path, out=tmp_path / "many", pictures=names).folder
+    assert sorted(file.stem for file in (page / "figures").iterdir()) == names
+
+
+def test_more_curves_of_one_ablation_than_colours_are_not_drawn_and_said(
+    made: Any, tmp_path: Path
+) -> None:
+    for other in range(8):
+        made.add(condition=f"c.d=x{other}")
+        for value in (1, 2, 3):
+            made.add(f"a.b={value}", condition=f"c.d=x{other}")
     made.write()
     page = build(made.store.path, out=tmp_path / "many", pictures=["sensitivity-a.b"]).folder
     said = (page / "table.md").read_text()

@@ -84,10 +84,10 @@ def draw(
 ) -> list[Picture]:
     """Draw the pictures of a report.
 
-    Each condition has the trade-offs of its ablations where there are several, quality during
-    training where it was evaluated, and changes over each setting that has three values. Each scene
-    and ablation has views and training curves of the first condition and replicate, which the
-    titles name.
+    Each condition has the trade-offs of its ablations where there are several, and quality during
+    training where it was evaluated. Each setting that has three values has changes over it. Each
+    scene and ablation has views and training curves of the first condition and replicate, which
+    the titles name.
 
     Args:
         store: The stores with the photographs, renders and histories.
@@ -167,49 +167,55 @@ def _trade_offs(comparison: Comparison) -> dict[str, _Drawing]:
 
 
 def _sensitivities(comparison: Comparison) -> dict[str, _Drawing]:
-    """Return the figures of changes over a setting, one for each condition and setting."""
+    """Return the figures of changes over each swept setting.
+
+    All curves of a setting are on one figure. Where there are more than a figure can tell apart,
+    each ablation has a figure of its own.
+    """
     drawings: dict[str, _Drawing] = {}
-    for condition in dict.fromkeys(condition for _, condition in comparison.groups):
-        for key, changes in sensitivities(comparison, condition).items():
-            known = set(changes.dropna(subset="change")["metric"])
-            axes = [metric for metric in comparison.metrics if metric.name in known & _DEPENDENT]
-            if not axes:
-                continue
-            title = titled(_SENSITIVITY_TITLE.format(base=comparison.base, key=key), condition)
-            name = _file_name(f"sensitivity-{for_file_name(key)}", condition)
-            drawings[name] = partial(_drawn, title, partial(dependence, title, key, changes, axes))
-            if (count := changes["series"].nunique()) >= MAX_ARMS:
+    for key, changes in sensitivities(comparison).items():
+        known = set(changes.dropna(subset="change")["metric"])
+        axes = [metric for metric in comparison.metrics if metric.name in known & _DEPENDENT]
+        parts = {"": changes}
+        if changes["series"].nunique() >= MAX_ARMS:
+            parts = {str(name): rows for name, rows in changes.groupby("ablation", sort=False)}
+        for ablation, rows in parts.items() if axes else ():
+            title = titled(_SENSITIVITY_TITLE.format(base=comparison.base, key=key), ablation)
+            name = _file_name(f"sensitivity-{for_file_name(key)}", ablation)
+            drawings[name] = partial(_drawn, title, partial(dependence, title, key, rows, axes))
+            if (count := rows["series"].nunique()) >= MAX_ARMS:
                 why = f"{count} curves, and a figure can tell {MAX_ARMS - 1} apart"
                 drawings[name] = partial(_not_drawn, title, why)
     return drawings
 
 
-def sensitivities(comparison: Comparison, condition: str) -> dict[str, pd.DataFrame]:
+def sensitivities(comparison: Comparison) -> dict[str, pd.DataFrame]:
     """Return how the changes depend on each numeric setting that was swept.
 
-    The label of an ablation has the value of a swept setting in it: `consistency.weight=0.05`, and
-    `densify densify.lr_grow=2 densify.lr_prune=1` with two settings.
+    The label of an ablation has the value of a setting that only the ablation has, as in
+    `consistency.weight=0.05`. The condition has the value of a setting that the base has too, as
+    in `variant.factor=2 variant.hr_fraction=0.1`.
 
     Args:
         comparison: The pairs of cells and their means.
-        condition: The condition that the cells were run under.
 
     Returns:
         By the setting's key, for each that has at least three values: one row for each change,
         with `level` (`pair`, `scene` or `mean`), `scene` (missing for a mean), `metric`, `change`,
-        `value` (of the setting) and `series` (the rest of the label: each is a curve).
+        `value` (of the setting), `ablation` (the rest of the label) and `series` (the rest of label
+        and condition: each is a curve).
     """
-    changes = _changes(comparison, condition)
+    changes = _changes(comparison)
     found = {}
-    for key, places in _settings(changes["label"].unique()).items():
-        rows = changes.merge(places, on="label")
+    for key, places in _settings(comparison.groups).items():
+        rows = changes.merge(places, on=["label", "condition"])
         values = rows.groupby("series")["value"].transform("nunique")
         if (values >= _MIN_SETTINGS).any():
             found[key] = rows[values >= _MIN_SETTINGS].sort_values("value", kind="stable")
     return found
 
 
-def _changes(comparison: Comparison, condition: str) -> pd.DataFrame:
+def _changes(comparison: Comparison) -> pd.DataFrame:
     """Return the changes of pairs, of scenes and of the means in one table, as tables show them."""
     pairs = comparison.pairs
     ratios = {metric.name for metric in comparison.metrics if is_ratio(metric)}
@@ -219,25 +225,29 @@ def _changes(comparison: Comparison, condition: str) -> pd.DataFrame:
         "scene": comparison.per_scene.reset_index(),
         "mean": comparison.means.reset_index().assign(scene=None),
     }
-    columns = ["label", "scene", "metric", "change"]
-    tables = [
-        table.loc[table["condition"] == condition, columns].assign(level=level)
-        for level, table in levels.items()
-    ]
+    columns = ["label", "condition", "scene", "metric", "change"]
+    tables = [table[columns].assign(level=level) for level, table in levels.items()]
     return pd.concat(tables, ignore_index=True)
 
 
-def _settings(labels: Iterable[str]) -> dict[str, pd.DataFrame]:
-    """Return the numeric settings of labels: by the key, `label`, `series` and `value`."""
-    found: dict[str, list[tuple[str, str, float]]] = {}
-    for label in labels:
+def _settings(groups: Iterable[tuple[str, str]]) -> dict[str, pd.DataFrame]:
+    """Return the numeric settings of labels and conditions: by the key, a row for each that has it.
+
+    A row has `label`, `condition`, and `value`, `ablation` and `series` of `sensitivities`.
+    """
+    found: dict[str, list[tuple[str, str, float, str, str]]] = {}
+    for label, condition in groups:
         words = label.split(" ")
-        for at, word in enumerate(words):
+        settings = condition.split(" ") if condition else []
+        for at, word in enumerate([*words, *settings]):
             key, _, text = word.partition("=")
             if abs(value := _number(text)) <= _MAX_SETTING:
-                rest = " ".join(words[:at] + words[at + 1 :])
-                found.setdefault(key, []).append((label, rest, value))
-    columns = ["label", "series", "value"]
+                ablation = words[:at] + words[at + 1 :]
+                series = [*words, *settings]
+                del series[at]
+                row = (label, condition, value, " ".join(ablation), " ".join(series))
+                found.setdefault(key, []).append(row)
+    columns = ["label", "condition", "value", "ablation", "series"]
     return {key: pd.DataFrame(rows, columns=columns) for key, rows in found.items()}
 
 
