@@ -176,10 +176,12 @@ def _sensitivities(comparison: Comparison) -> dict[str, _Drawing]:
     for key, changes in sensitivities(comparison).items():
         known = set(changes.dropna(subset="change")["metric"])
         axes = [metric for metric in comparison.metrics if metric.name in known & _DEPENDENT]
+        if not axes:
+            continue
         parts = {"": changes}
         if changes["series"].nunique() >= MAX_ARMS:
             parts = {str(name): rows for name, rows in changes.groupby("ablation", sort=False)}
-        for ablation, rows in parts.items() if axes else ():
+        for ablation, rows in parts.items():
             title = titled(_SENSITIVITY_TITLE.format(base=comparison.base, key=key), ablation)
             name = _file_name(f"sensitivity-{for_file_name(key)}", ablation)
             drawings[name] = partial(_drawn, title, partial(dependence, title, key, rows, axes))
@@ -237,15 +239,14 @@ def _settings(groups: Iterable[tuple[str, str]]) -> dict[str, pd.DataFrame]:
     """
     found: dict[str, list[tuple[str, str, float, str, str]]] = {}
     for label, condition in groups:
-        words = label.split(" ")
-        settings = condition.split(" ") if condition else []
-        for at, word in enumerate([*words, *settings]):
+        words = f"{label} {condition}".strip().split(" ")
+        label_words = label.count(" ") + 1
+        for at, word in enumerate(words):
             key, _, text = word.partition("=")
             if abs(value := _number(text)) <= _MAX_SETTING:
-                ablation = words[:at] + words[at + 1 :]
-                series = [*words, *settings]
-                del series[at]
-                row = (label, condition, value, " ".join(ablation), " ".join(series))
+                rest = words[:at] + words[at + 1 :]
+                ablation = rest[: label_words - (at < label_words)]
+                row = (label, condition, value, " ".join(ablation), " ".join(rest))
                 found.setdefault(key, []).append(row)
     columns = ["label", "condition", "value", "ablation", "series"]
     return {key: pd.DataFrame(rows, columns=columns) for key, rows in found.items()}
