@@ -374,6 +374,7 @@ class Conf:
     limits: LimitsConf
     lpips: LpipsConf
     retry: str
+    baseline: bool
     fail_fast: bool
     dry_run: bool
     track: str

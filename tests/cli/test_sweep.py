@@ -54,6 +54,32 @@ def test_a_sweep_trains_each_cell_once_and_ends_with_the_table(
     assert record.cells[1].baseline_id == record.cells[0].cell_id
 
 
+def test_without_the_baseline_the_ablations_are_trained_alone(
+    sweep_here: SweepHere, children: Any, tmp_path: Path
+) -> None:
+    code, _, err = sweep_here("+ablation=consistency,densify", "baseline=false", *SCENE)
+    assert code == 0, err
+    assert len(children.trained) == 2
+    rows = Store(tmp_path / "s").sweep_record().cells
+    assert [(row.label, row.baseline_id) for row in rows] == [
+        ("consistency", None), ("densify", None)
+    ]  # fmt: skip
+    _, _, err = sweep_here("+ablation=densify", *SCENE, "dry_run=true")
+    assert "plan: 2 cells, 1 done" in err
+
+
+def test_the_baseline_that_a_count_is_taken_from_is_trained(sweep_here: SweepHere) -> None:
+    control = ("+ablation=count_matched", "matched_to=baseline", *SCENE)
+    _, _, err = sweep_here(*control, "baseline=false", "dry_run=true")
+    assert labels(err) == {"baseline", "count_matched to baseline"}
+
+
+def test_a_sweep_without_any_cell_is_refused(sweep_here: SweepHere) -> None:
+    code, _, err = sweep_here(*SCENE, "baseline=false", "dry_run=true")
+    assert code == 1
+    assert "baseline=false: no cell is left" in err
+
+
 @pytest.mark.usefixtures("children")
 def test_a_sweep_of_several_variants_says_which_one_is_built(sweep_here: SweepHere) -> None:
     _, _, err = sweep_here(*SCENE, "variant.factor=2,3")

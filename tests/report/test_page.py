@@ -278,6 +278,21 @@ def test_another_base_has_a_report_of_its_own_that_names_it(made: Any) -> None:
     assert changes == pytest.approx({("baseline", "a/b {x}"): -5.0, ("c", "a/b {x}"): 5.0})
 
 
+def test_without_a_baseline_the_first_label_is_the_base(made: Any) -> None:
+    for label, psnr in (("plus", 1.0), ("lean", 1.25)):
+        made.add(label, factors={"psnr": psnr})
+    for row in made.rows:
+        row["baseline_id"] = None
+    sweep_id = made.write()
+    report = build(made.store.path, pictures=[])
+    assert report.folder == made.store.path / "reports" / sweep_id
+    assert "lean against plus" in report.text
+    with (report.folder / "table.csv").open(newline="") as stream:
+        rows = [row for row in csv.DictReader(stream) if row["metric"] == "psnr"]
+    changes = {(row["label"], row["against"]): float(row["change"]) for row in rows}
+    assert changes == pytest.approx({("lean", "plus"): 5.0})
+
+
 def test_an_unknown_base_is_named_with_those_there_are(study: Any) -> None:
     study.write()
     with pytest.raises(ReportError, match=r"against=plus: .*: baseline, consistency"):

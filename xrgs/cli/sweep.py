@@ -41,6 +41,7 @@ Commas make axes, +ablation=[a,b] stacks. Finished cells are found in the store 
   seed=0,1    store=FOLDER    data_root=FOLDER    threads=N    dry_run=true
   limits.minutes=N  limits.memory_gb=N    end cells that exceed a limit, and count them as failed
   retry=failed      fail_fast=true        train failed cells again; stop after the first failure
+  baseline=false                          train the ablations alone
 
 xrgs-sweep rerun=CELL_FOLDER [out=FOLDER] [store=FOLDER] [threads=N] [scene.path=FOLDER]
            [plugins=NAME[,NAME]...]

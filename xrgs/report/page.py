@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
     import pandas as pd
 
+    from xrgs.experiment.schema import RecordedCell
     from xrgs.report.compare import Comparison
     from xrgs.report.external import External
 
@@ -127,7 +128,8 @@ def build(
             name `.scenes-<names>` and `.ablations-<names>` are added for a choice, and
             `.against-<label>` for another base than the baseline.
         pictures: Names of the pictures to draw, see `xrgs.report.pictures.draw`; None draws all.
-        against: The label that all others are compared with.
+        against: The label that all others are compared with. Where no cell is a baseline
+            (`baseline=false`), the first label stands in for it.
         choice: Which scenes and ablations of the sweeps the report has.
         externals: Renders of other programs; each becomes one more label. The default folder's name
             then ends with `.with-<label>` for each.
@@ -147,12 +149,13 @@ def build(
     named = (sweep_ids,) if isinstance(sweep_ids, str) else sweep_ids
     ids = tuple(dict.fromkeys(named or store.latest_sweeps()))
     commands, rows = store.sweep_records(ids)
-    sweep = read_cells(store, commands, choice.rows(rows, against))
+    base = _base(rows, against)
+    sweep = read_cells(store, commands, choice.rows(rows, base))
     sweep = with_variants(sweep, store)
     sweep = with_external(sweep, store, externals)
     store = replace(store, external=sweep.renders)
     sweep = replace(sweep, views=with_texture(store, sweep.cells, sweep.views))
-    tables = _tables(sweep, against, design)
+    tables = _tables(sweep, base, design)
     name = _folder_name(ids, choice, against, externals)
     folder = out if out else store.stores[0].reports / name
     try:
@@ -166,6 +169,12 @@ def build(
     written = {p.file for p in drawn if p.file} | {folder / name for name in _FILES}
     text = f"{_text(tables, _warnings(sweep))}\n{for_line(f'Written to {folder}')}"
     return Report(text=text, folder=folder, files=tuple(sorted(written)))
+
+
+def _base(rows: Sequence[RecordedCell], against: str) -> str:
+    """Return `against`, or the first label for the baseline of a sweep that has none."""
+    labels = [row.label for row in rows]
+    return labels[0] if against == BASELINE and BASELINE not in labels else against
 
 
 def _tables(sweep: Sweep, against: str, design: Design | None) -> Tables:

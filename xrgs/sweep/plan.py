@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 from xrgs.capture import scenes
 from xrgs.capture.folders import TO_TRY
+from xrgs.errors import XrgsError
 from xrgs.experiment.cell_folder import CellState
 from xrgs.experiment.identity import cell_id, cell_identity
 from xrgs.experiment.schema import RecordedCell
@@ -115,6 +116,27 @@ def planned(spec: CellSpec, conf: Conf) -> PlannedCell:
     if conf.matched_to is not None:
         spec = replace(spec, label=f"{spec.label} to {conf.matched_to}")
     return PlannedCell(spec, conf)
+
+
+def with_wanted_baselines(plan: Sequence[PlannedCell]) -> list[PlannedCell]:
+    """Return the cells without the baselines that `baseline=false` leaves out.
+
+    The baseline that a count-matched cell takes its number from stays.
+
+    Raises:
+        XrgsError: No cell is left.
+    """
+    references = {cell.reference for cell in plan}
+    wanted = [
+        cell
+        for cell in plan
+        if cell.conf.baseline or cell.spec.label != BASELINE or cell.spec in references
+    ]
+    if not wanted:
+        raise XrgsError(
+            "baseline=false: no cell is left to train; name an ablation (+ablation=plus)"
+        )
+    return wanted
 
 
 def identified(cell: PlannedCell, store: Store, holders: Mapping[str, str]) -> PlannedCell:
@@ -308,7 +330,7 @@ def _remaining(plan: Sequence[PlannedCell]) -> str:
 
 
 def record(plan: Sequence[PlannedCell]) -> list[RecordedCell]:
-    """Return the rows that reports are made from; every baseline must be in the plan."""
+    """Return the rows that reports are made from."""
     baselines = {cell.spec.shared: cell.cell_id for cell in plan if cell.spec.label == BASELINE}
     return [
         RecordedCell(
@@ -320,7 +342,7 @@ def record(plan: Sequence[PlannedCell]) -> list[RecordedCell]:
             variant_seed=cell.conf.variant.seed,
             seed=cell.conf.seed,
             variant_id=cell.variant_id,
-            baseline_id=baselines[cell.spec.shared],
+            baseline_id=baselines.get(cell.spec.shared),
             # A report reads the state of a cell with an id itself.
             error=cell.state.reason if _lacks_id_for_now(cell) else cell.error,
             state=_recorded_state(cell),

@@ -55,6 +55,7 @@ from xrgs.sweep.plan import (
     record,
     unchanged,
     will_fail,
+    with_wanted_baselines,
     without_kernels,
 )
 
@@ -222,7 +223,8 @@ class Study:
         """Return every cell of the command line; references come before count-matched cells.
 
         Raises:
-            XrgsError: `matched_to` has no effect, or names a cell that is count-matched itself.
+            XrgsError: `matched_to` has no effect, or names a cell that is count-matched itself;
+                or `baseline=false` leaves no cell.
         """
         plan: dict[CellSpec, PlannedCell] = {}
         combinations = expand(arguments)
@@ -235,7 +237,7 @@ class Study:
             plan.setdefault(cell.spec, cell)
         controls.check_effect(combinations, plan.values())
         scenes.check_labels(cell.conf.scene for cell in plan.values())
-        return list(plan.values())
+        return with_wanted_baselines(list(plan.values()))
 
     def _with_effective_match(self, spec: CellSpec) -> CellSpec:
         """Drop `matched_to` unless the ablation is count-matched."""
