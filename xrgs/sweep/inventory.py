@@ -103,9 +103,10 @@ def _date(seconds: float | None) -> str:
 def show(store: Store, cell: CellRow) -> str:
     """Describe one cell: its state, its differences from the baseline, scores and files."""
     base_id = cell.recorded.baseline_id if cell.recorded else None
+    base = f"its baseline {base_id}" if base_id else "its baseline"
     sections = {
         "": _head(cell),
-        f"differs from its baseline {base_id} in": _differences(store, cell, base_id),
+        f"differs from {base} in": _differences(store, cell, base_id),
         "scores (means over the scored views)": _scores(cell.folder),
         "made with": _provenance(cell.folder),
         "files": _files(cell.folder),
