@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 import tomllib
@@ -96,3 +97,9 @@ def test_links_lead_to_files_of_the_repository(site: Path) -> None:
     assert 'href="conf/config/"' in (site / "study/index.html").read_text().replace("../", "")
     assert (site / "reports/recipes/figures/flower--plus.png").is_file()
     assert (site / "reports/recipes/table/index.html").is_file()
+
+
+def test_every_study_is_in_the_navigation() -> None:
+    studies = {str(file.relative_to(ROOT)) for file in ROOT.glob("reports/*/NOTES.md")}
+    listed = set(re.findall(r"reports/\w+/NOTES\.md", (ROOT / "mkdocs.yml").read_text("utf-8")))
+    assert listed == studies
