@@ -46,7 +46,8 @@ def report(
             with reports/ID.against-LABEL.
         pictures: `all`, `none`, or names of figures without their ending, such as `trade-off` or
             `fern--plus`. `none` leaves the pictures of report.html out too.
-        against: The label that all others are compared with.
+        against: The label that all others are compared with. In a sweep with `baseline=false` it is
+            the first by default.
         external: Another program's renders of the test views, as one more label. FOLDER has
             SCENE/VIEW.png, or VIEW.png where there is one scene, as 8-bit RGB of the photograph's
             size.
