@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 import resource
 import shutil
 import zlib
@@ -162,6 +163,25 @@ def test_the_table_has_a_row_a_view_and_leaves_originals_out(mixed: Variant) -> 
     text = to_text(table)
     assert "1 HR and 1 LR to train on, 1 held out" in text
     assert "originals of degraded views kept beside them: 1" in text
+
+
+@pytest.mark.parametrize(
+    ("needs", "said"),
+    [
+        ([1.0, 1.2, 1.4, 1.45], r"^hardly a mixture: 0 of 4 .*keep_large"),
+        ([1.0, 1.0, 1.0, 1.0, 3.0], r"^hardly a mixture: 1 of 5 .*keep_large"),
+        ([1.0, 1.0, 1.0, 1.6], r"^a mixture: 1 of 4 .*plus"),
+    ],
+)
+def test_it_says_whether_it_is_a_mixture(
+    mixed: Variant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, needs: list[float], said: str
+) -> None:
+    original, test, train, _ = mixed.views
+    views = [replace(train, name=str(i), need=need) for i, need in enumerate(needs)]
+    made = replace(mixed, views=(original, test, *views))
+    monkeypatch.setattr(variant, "load", lambda _: made)
+    monkeypatch.setattr(description, "read_report", lambda _: SfmReport())
+    assert re.search(said, describe(tmp_path, tmp_path / "sheet.png"), re.MULTILINE)
 
 
 def test_a_failed_variant_says_what_was_tried(tmp_path: Path) -> None:
