@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from hypothesis import HealthCheck, settings
 
 from tests import forks
 from xrgs import composing, config
@@ -33,6 +34,10 @@ from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.evaluation.lpips import weights
 from xrgs.experiment.store import Store
 from xrgs.splat.cameras import Camera
+
+# How long an example takes tells how busy the machine is, and fails no test.
+settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("untimed")
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -237,9 +237,7 @@ def test_values_are_of_their_types_and_interpolations_resolved(compose: Compose)
 texts = st.text(alphabet="${}\\\\ab':.,é")
 
 
-@settings(
-    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(text=texts)
 def test_texts_are_taken_literally(baseline: Conf, text: str) -> None:
     conf = replace(
@@ -380,7 +378,7 @@ class NewComponentsConf(ComponentsConf):
     added: SupersampledConf
 
 
-@settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(variance=st.sampled_from([0.0, 0.2]), every=st.integers(), late_from=st.integers())
 def test_what_is_added_and_off_changes_no_identity(
     baseline: Conf, variance: float, every: int, late_from: int

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from xrgs.capture.alignment import fit_similarity, pose_error
@@ -36,7 +36,6 @@ def moved(
     return changed
 
 
-@settings(deadline=None)
 @given(st.integers(0, 10_000), st.floats(0.01, 100), st.integers(3, 12))
 def test_a_similarity_of_the_world_is_not_an_error(seed: int, scale: float, count: int) -> None:
     rng = np.random.default_rng(seed)
@@ -45,7 +44,6 @@ def test_a_similarity_of_the_world_is_not_an_error(seed: int, scale: float, coun
     assert max(error.values()) < 1e-6
 
 
-@settings(deadline=None)
 @given(st.integers(0, 10_000), st.floats(0.01, 100))
 def test_the_similarity_of_moved_points_is_fitted(seed: int, scale: float) -> None:
     rng = np.random.default_rng(seed)
@@ -56,7 +54,6 @@ def test_the_similarity_of_moved_points_is_fitted(seed: int, scale: float) -> No
     assert t == pytest.approx(shift, abs=1e-7)
 
 
-@settings(deadline=None)
 @given(st.integers(0, 10_000))
 def test_mirrored_points_are_fitted_by_a_rotation_and_not_by_a_reflection(seed: int) -> None:
     """No rotation fits better than scipy's, and the scale is that of linear least squares."""

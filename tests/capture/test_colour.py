@@ -86,7 +86,7 @@ def test_grey_with_a_profile(tmp_path: Path, bits: int) -> None:
     assert picture.notes == ("converted from Gamma 2.2 to sRGB",)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(arrays(np.uint16, (3, 5, 3)), st.sampled_from([DISPLAY_P3, ADOBE_RGB]))
 def test_16_bits_stay_16_through_a_profile(
     samples: NDArray[np.uint16], primaries: tuple[tuple[float, float, float], ...]

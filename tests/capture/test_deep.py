@@ -45,9 +45,7 @@ def check(file: Path, samples: NDArray[Any], white: int = 65535, error: float = 
         assert np.abs(picture.alpha - alpha).max() < 1e-6
 
 
-@settings(
-    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(samples=SAMPLES, interlaced=st.booleans())
 def test_a_png_of_16_bits(tmp_path: Path, samples: NDArray[np.uint16], interlaced: bool) -> None:
     samples[0, 0] = 65535

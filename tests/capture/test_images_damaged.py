@@ -26,9 +26,7 @@ from xrgs.capture.images import ImageError
 from xrgs.errors import UnreadableError
 
 pillow_heif.register_heif_opener()
-FAST = settings(
-    max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+FAST = settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
 #: A change of valid bytes: where (as a fraction), how many are replaced, and by what.
 CHANGES = st.tuples(st.floats(0, 1), st.integers(0, 40), st.binary(max_size=12))
 

@@ -74,7 +74,7 @@ def test_the_table_of_models_is_pycolmaps() -> None:
 
 @pytest.mark.parametrize("model", SERVED)
 @given(data=st.data())
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_every_model_projects_as_pycolmap_also_when_resized_and_cropped(
     model: str, data: st.DataObject
 ) -> None:

@@ -354,7 +354,7 @@ HIDDEN = st.integers(0, 2**32 - 1).map(lambda seed: noise((60, 40), seed))
 
 @pytest.mark.parametrize("alpha", [False, True])
 @pytest.mark.parametrize("degradation", ["downsample", "digital_zoom", "jpeg"])
-@settings(max_examples=4, deadline=None)
+@settings(max_examples=4)
 @given(hidden=HIDDEN)
 def test_what_is_hidden_changes_no_bit_of_what_is_trained_and_scored(
     tmp_path_factory: pytest.TempPathFactory,

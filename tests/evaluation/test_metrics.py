@@ -202,7 +202,7 @@ def half_mask() -> Tensor:
     return mask
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.integers(0, 2**32 - 1))
 def test_what_is_hidden_by_a_mask_changes_no_score(seed: int) -> None:
     (image, target), mask = pair(), half_mask()

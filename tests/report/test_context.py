@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.report.conftest import configured, finish_again
@@ -221,7 +221,6 @@ def test_what_no_view_decides_has_no_caution(made: Any, changes: list[float]) ->
 
 
 @given(st.lists(st.integers(-2000, 2000), min_size=3, max_size=9, unique=True))
-@settings(deadline=None)
 def test_it_is_what_leaving_out_each_view_in_turn_says(hundredths: list[int]) -> None:
     scores = 20.0 + np.array(hundredths) / 100
     pair = {"label": "a", "condition": "", "scene": "s", "variant_seed": 0, "seed": 0}

@@ -49,7 +49,6 @@ def tables(draw: st.DrawFn, *, may_have_lists: bool = True) -> NDArray[np.void]:
 @pytest.mark.filterwarnings("ignore:loadtxt")  # plyfile reads a list of no entries so
 @settings(
     max_examples=100,
-    deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 def test_what_plyfile_writes_is_read(

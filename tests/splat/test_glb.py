@@ -264,7 +264,6 @@ def test_a_missing_file_and_a_folder(tmp_path: Path) -> None:
 @given(place=st.integers(0, 5000), junk=st.binary(min_size=1, max_size=12), cut=st.booleans())
 @settings(
     max_examples=150,
-    deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 def test_a_damaged_file_is_read_or_refused_and_nothing_else(

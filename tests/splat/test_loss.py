@@ -91,7 +91,7 @@ def test_ssim_keeps_its_digits_near_convergence(
     assert (grad32 - grad64).norm() <= 1e-6 * grad64.norm()
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(
     levels=st.tuples(*[st.floats(-1e4, 1e4, width=32)] * 2),
     noisy=st.booleans(),

@@ -249,7 +249,6 @@ def test_other_formats_are_named_with_the_command_that_converts_them(name: str) 
 @given(place=st.integers(0, 2400), junk=st.binary(min_size=1, max_size=12), cut=st.booleans())
 @settings(
     max_examples=300,
-    deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 def test_a_damaged_file_is_read_or_refused_and_nothing_else(

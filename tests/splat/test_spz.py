@@ -181,7 +181,6 @@ def test_a_missing_file_and_a_folder(tmp_path: Path) -> None:
 )
 @settings(
     max_examples=200,
-    deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 def test_a_damaged_file_is_read_or_refused_and_nothing_else(

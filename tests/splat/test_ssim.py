@@ -84,7 +84,7 @@ def test_ssim_is_scikit_images() -> None:
     assert value.item() == pytest.approx(expected, rel=1e-10)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     size=st.tuples(st.integers(11, 24), st.integers(11, 24)),
     seeds=st.tuples(st.integers(0, 10**6), st.integers(0, 10**6)),

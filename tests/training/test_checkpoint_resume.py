@@ -169,7 +169,7 @@ def test_a_killed_run_ends_as_one_never_killed(
     at_random = [random.randrange(total // 4, total), random.randrange(1, total)]
     phases = [Phase.explicit] if backend == "torch" else [Phase.explicit, Phase.generate]
 
-    @settings(max_examples=2, phases=phases, deadline=None)
+    @settings(max_examples=2, phases=phases)
     @example(kills=at_random, every=random.randint(1, 9))
     @given(kills=st.lists(st.integers(1, total), min_size=1, max_size=2), every=st.integers(1, 9))
     def check(kills: list[int], every: int) -> None:

@@ -88,7 +88,7 @@ def test_it_is_the_torch_loss_in_double(
     assert error <= 2e-6 * exact_gradient.abs().max()
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(size=st.tuples(st.integers(11, 60), st.integers(11, 90)), seed=st.integers(0, 10**6))
 def test_any_size(size: tuple[int, int], seed: int) -> None:
     image, photograph = pair(*size, seed)

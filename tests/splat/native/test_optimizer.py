@@ -118,7 +118,7 @@ def change(of: SplatOptimizer, what: str, seed: int) -> None:
         of.reset("opacities", of.gaussians.opacities.detach().clamp_max(-1.0))
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     plan=st.lists(
         st.tuples(

@@ -292,7 +292,7 @@ def test_gradients_are_nearly_as_exact_as_float32_in_torch() -> None:
     antialiased=st.booleans(),
 )
 @example(seed=1, count=1, width=1, height=1, size=3.25, stretch=2.25, antialiased=False)  # cancels
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_random_scenes(
     seed: int, count: int, width: int, height: int, size: float, stretch: float, antialiased: bool
 ) -> None:

@@ -36,7 +36,7 @@ def test_a_banded_matrix_is_the_dense_one(old: int, new: int, transposed: bool) 
     assert torch.equal(filled, dense.float())
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(old=st.tuples(side, side), new=st.tuples(side, side), seed=st.integers(0, 10**6))
 def test_the_gradient_is_by_the_transpose(
     old: tuple[int, int], new: tuple[int, int], seed: int

@@ -85,7 +85,7 @@ def assert_same(ours: Ours, theirs: Theirs) -> None:
         assert torch.equal(ours.strategy.visible_count[0], theirs.state["count"])
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     count=st.integers(1, 60),
     views=st.integers(1, 4),

@@ -92,7 +92,7 @@ def gsplats(
     return Counter(theirs.params["sh0"][:, 0, 0].int().tolist())
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     count=st.integers(1, 60),
     order=st.text("hl", min_size=1, max_size=6),
@@ -121,7 +121,7 @@ def test_each_group_grows_by_its_own_statistics(
     assert refinement.by_group["grown_LR"] == len(expected["LR"])
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     count=st.integers(1, 60),
     order=st.text("hl", min_size=1, max_size=6),
@@ -202,7 +202,7 @@ def test_pooled_groups_with_the_same_thresholds_are_as_none(step: int, order: st
     assert without.by_group == {}
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     count=st.integers(1, 60),
     order=st.text("hl", min_size=1, max_size=6),

@@ -70,7 +70,7 @@ def test_float32_is_float64_outside_a_band_around_the_thresholds() -> None:
     dtype=st.sampled_from([torch.float32, torch.float64]),
     antialiased=st.booleans(),
 )
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_random_scenes(
     seed: int,
     count: int,

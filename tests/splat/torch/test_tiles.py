@@ -79,7 +79,7 @@ def test_too_many_pairs_is_an_error_before_they_are_made(monkeypatch: pytest.Mon
     lengths=st.lists(st.integers(0, 9), min_size=6, max_size=6),
     elements=st.integers(1, 2000),
 )
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_batches_hold_each_tile_once_with_its_list(lengths: list[int], elements: int) -> None:
     grid = TileGrid(24, 16, 8)
     tile = torch.repeat_interleave(torch.tensor(lengths))
