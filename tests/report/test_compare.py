@@ -495,6 +495,17 @@ def test_another_label_is_the_base_of_its_own_scene_condition_and_replicate(made
     assert comparison.missing().empty
 
 
+def test_cells_of_a_sweep_without_a_baseline_are_compared_with_that_of_a_joined_one(
+    made: Any,
+) -> None:
+    for seed, psnr in enumerate((20.0, 22.0)):
+        made.add(seed=seed, values={"psnr": psnr})
+        made.add("plus", seed=seed, values={"psnr": psnr + 1 + seed})
+        made.rows[-1]["baseline_id"] = None
+    pairs = compared(made).pairs.query("metric == 'psnr'")
+    assert list(pairs["effect"]) == pytest.approx([1, 2])
+
+
 def test_an_unknown_label_names_those_there_are(made: Any) -> None:
     made.add()
     made.add("consistency")

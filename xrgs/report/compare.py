@@ -230,18 +230,18 @@ def _tested(means: pd.DataFrame, metrics: Sequence[Metric], design: Design) -> p
 def _with_base(cells: pd.DataFrame, against: str) -> pd.DataFrame:
     """Return the cells with `base_id` and `elsewhere`, as `Comparison.cells` has them.
 
-    The record names the baseline; any other base is found by scene, condition and replicate.
+    A base is found by scene, condition and replicate. The record names the baseline, but for a
+    sweep without it (`baseline=false`), which may be joined with one that has it.
     """
+    labels = list(dict.fromkeys(cells["label"]))
+    if against not in {*labels, BASELINE}:
+        raise ReportError(
+            f"against={against}: the sweep has no such label; choose from: {', '.join(labels)}"
+        )
+    bases = cells[cells["label"] == against].drop_duplicates(_PAIR).set_index(_PAIR)
+    base_id = cells[_PAIR].join(bases["cell_id"], on=_PAIR)["cell_id"]
     if against == BASELINE:
-        base_id = cells["baseline_id"]
-    else:
-        labels = list(dict.fromkeys(cells["label"]))
-        if against not in labels:
-            raise ReportError(
-                f"against={against}: the sweep has no such label; choose from: {', '.join(labels)}"
-            )
-        bases = cells[cells["label"] == against].drop_duplicates(_PAIR).set_index(_PAIR)
-        base_id = cells[_PAIR].join(bases["cell_id"], on=_PAIR)["cell_id"]
+        base_id = cells["baseline_id"].where(cells["baseline_id"].notna(), base_id)
     base_id = base_id.where(cells["label"] != against, cells["cell_id"])
     machines = cells.drop_duplicates("cell_id").set_index("cell_id")["machine"]
     machine, of_base = cells["machine"], base_id.map(machines).astype(object).fillna("")
