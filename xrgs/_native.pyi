@@ -32,6 +32,7 @@ def photometric_loss(
     with_gradient: bool,
     threads: int,
 ) -> tuple[float, Tensor | None]: ...
+def window_moments(image: Tensor, window: Tensor, threads: int) -> tuple[Tensor, Tensor]: ...
 def adam_step(
     groups: list[tuple[Tensor, Tensor, Tensor, Tensor, float, float]],
     beta1: float,

@@ -21,6 +21,7 @@
 #include "densify/grad2d.h"
 #include "isa.h"
 #include "loss/photometric.h"
+#include "loss/window_moments.h"
 #include "optim/adam.h"
 #include "raster/frame.h"
 #include "raster/render.h"
@@ -353,9 +354,27 @@ void raster_part(int threads, bool antialiased, bool absgrad, bool raw, const ch
   backward.print(backward_name);
 }
 
+void window_moments(int threads, const Floats& image) {
+  double window[xrgs::kWindow];
+  for (int tap = 0; tap < xrgs::kWindow; ++tap)
+    window[tap] = kWindowWeights[std::abs(tap - xrgs::kWindow / 2)];
+  Target target = make_target(image);
+  const xrgs::WindowMomentsJob job{
+      image.data(), kHeight, kWidth, window, target.mean.data(), target.variance.data()};
+  parallel_for(threads, kMapHeight, [&](std::int64_t task) {
+    const int row = static_cast<int>(task);
+    XRGS_SELECT(window_moments_kernels).rows(job, row, row + 1);
+  });
+  Hash hash;
+  hash.add(target.mean);
+  hash.add(target.variance);
+  hash.print("window-moments");
+}
+
 void loss_part(int threads) {
   Random random(3);
   const Floats image = random.array(3 * kPixels, 0.0f, 1.0f);
+  window_moments(threads, image);
   Floats other = image;
   for (float& value : other) value += random.between(-0.1f, 0.1f);
   const Target target = make_target(other);

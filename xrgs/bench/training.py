@@ -53,7 +53,7 @@ class TrainingStep:
             self.optimizer, self.settings, scene_scale=1.0, generator=torch.Generator()
         )
         self.render()
-        self.target = prepare_target(self.rendered.image.detach() + 0.01)
+        self.target = prepare_target(self.rendered.image.detach() + 0.01, backend=backend)
 
     def render(self) -> None:
         """Render; the native backend activates the parameters as it reads them."""
@@ -187,11 +187,11 @@ def loss_gradients(load: Load, backend: str) -> tuple[Callable[[], Tensor], ...]
     shape = (2, load.camera.height, load.camera.width, 3)
     image, photograph = torch.rand(shape, generator=generator)
     image.requires_grad_()
-    target = prepare_target(photograph)
+    target = prepare_target(photograph, backend=backend)
 
     def gradient(*, prepared: bool) -> Tensor:
         with use_threads(1):
-            used = target if prepared else prepare_target(photograph)
+            used = target if prepared else prepare_target(photograph, backend=backend)
             loss = photometric_loss(image, used, l1=L1, ssim=SSIM, backend=backend)
             found: Tensor = torch.autograd.grad(loss, image)[0]
             return found

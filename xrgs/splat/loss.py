@@ -9,26 +9,25 @@ from __future__ import annotations
 from torch import Tensor
 
 from xrgs.splat.backend import implementation
-from xrgs.splat.ssim import WINDOW, Target, window_moments
+from xrgs.splat.ssim import WINDOW, Target
 
 __all__ = ["WINDOW", "Target", "photometric_loss", "prepare_target"]
 
-#: Rows of windows whose moments are computed at once. At 1,008 px they stay in the processor's
-#: cache, and the moments take a tenth of the time of all rows at once.
-_ROWS = 32
 
-
-def prepare_target(image: Tensor) -> Target:
+def prepare_target(image: Tensor, *, backend: str = "torch") -> Target:
     """Compute the statistics of a photograph that `photometric_loss` needs.
 
     Args:
         image: [H, W, 3], values of range 1; a resampled photograph may leave 0..1.
+        backend: `torch`, `native` or `auto` (`resolve_backend`). The native backend takes float32
+            on the CPU only, and gives the same bits.
 
     Returns:
         The photograph and its statistics, of its dtype and without a graph.
 
     Raises:
-        ValueError: `image` is not [H, W, 3] or is smaller than the SSIM window.
+        ValueError: `image` is not [H, W, 3] or is smaller than the SSIM window, or for the native
+            backend it is not float32 on the CPU.
     """
     if image.ndim != 3 or image.shape[2] != 3:
         raise ValueError(f"image must be [H, W, 3], got {list(image.shape)}")
@@ -38,13 +37,7 @@ def prepare_target(image: Tensor) -> Target:
             f"image of {width} x {height} px is smaller than the SSIM window of {WINDOW} px"
         )
     image = image.detach().contiguous()
-    mean, variance = (image.new_empty(height - WINDOW + 1, width - WINDOW + 1, 3) for _ in range(2))
-    for row in range(0, len(mean), _ROWS):
-        rows = slice(row, row + _ROWS)
-        # In double, since a variance is a small difference of squares.
-        moments = window_moments(image[row : row + _ROWS + WINDOW - 1].double())
-        mean[rows], variance[rows] = moments
-    return Target(image, mean, variance)
+    return Target(image, *implementation("loss", backend).target_moments(image))
 
 
 def photometric_loss(

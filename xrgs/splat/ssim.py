@@ -18,6 +18,9 @@ WINDOW = SSIM_WINDOW
 """Taps of the window along each axis."""
 SIGMA = 1.5
 """Standard deviation of the window, px."""
+_TAPS = [math.exp(-((tap - WINDOW // 2) ** 2) / (2 * SIGMA**2)) for tap in range(WINDOW)]
+WEIGHTS = tuple(tap / math.fsum(_TAPS) for tap in _TAPS)
+"""The window's weights along an axis, which sum to 1."""
 C1 = 0.01**2
 """(K1 L)^2 with K1 = 0.01, for a data range L of 1."""
 C2 = 0.03**2
@@ -43,7 +46,7 @@ def window_mean(image: Tensor) -> Tensor:
         [H - 10, W - 10, C]
     """
     channels = image.shape[-1]
-    kernel = image.new_tensor(_weights())  # [11]
+    kernel = image.new_tensor(WEIGHTS)  # [11]
     # `image[None].permute`, not `image.permute()[None]`: only then is it channels-last to oneDNN,
     # and the depth-wise kernel five times as fast (2 threads, 504 x 378).
     planes: Tensor = image[None].permute(0, 3, 1, 2)  # [1, C, H, W]
@@ -71,15 +74,9 @@ def window_moments(image: Tensor) -> tuple[Tensor, Tensor]:
     return mean, (square - mean * mean).clamp_min(0)
 
 
-def _weights() -> list[float]:
-    """Return the window's weights along an axis, which sum to 1."""
-    taps = [math.exp(-((tap - WINDOW // 2) ** 2) / (2 * SIGMA**2)) for tap in range(WINDOW)]
-    return [tap / math.fsum(taps) for tap in taps]
-
-
 def _weighted_sum(image: Tensor, axis: int) -> Tensor:
     """Return the weighted sum of the window around each place that it fits around along an axis."""
-    first, *others = _weights()
+    first, *others = WEIGHTS
     length = image.shape[axis] - WINDOW + 1
     total = image.narrow(axis, 0, length) * first
     term = torch.empty_like(total)

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from xrgs.runtime.machine import single_torch_thread
 from xrgs.runtime.progress import progress
 from xrgs.splat.backend import resolve_backend
 from xrgs.splat.gaussians import PARAMETERS, Gaussians, from_points
@@ -97,7 +96,8 @@ def train(
 class _Views:
     """The training views as components want them at present, and their targets for the loss."""
 
-    def __init__(self, views: Iterable[TrainingView]) -> None:
+    def __init__(self, views: Iterable[TrainingView], backend: str) -> None:
+        self.backend = backend
         self.own: Mapping[str, TrainingView] = {view.name: view for view in views}
         self.present: Mapping[str, TrainingView] = {}
         self.drawn: Target | None = None
@@ -108,7 +108,7 @@ class _Views:
         """Use other views, with the moments of their photographs."""
         if views is not self.present:
             self.present = views
-            self.moments = OnDemand(_moments, views.values())
+            self.moments = OnDemand(self._moments, views.values())
 
     def target(self, view: TrainingView) -> Target:
         """Return the target of a present view; its photograph is a new tensor where 8 bits are."""
@@ -117,13 +117,10 @@ class _Views:
         self.drawn = Target(view.image, *self.moments[view.name])
         return self.drawn
 
-
-def _moments(view: TrainingView) -> tuple[Tensor, Tensor]:
-    """The moments of a view's photograph that the loss needs (`Target`)."""
-    # More threads are slower where another program has a core, since the blocks of rows are small.
-    with single_torch_thread():
-        target = prepare_target(view.image)
-    return target.mean, target.variance
+    def _moments(self, view: TrainingView) -> tuple[Tensor, Tensor]:
+        """The moments of a view's photograph that the loss needs (`Target`)."""
+        target = prepare_target(view.image, backend=self.backend)
+        return target.mean, target.variance
 
 
 @dataclass(frozen=True)
@@ -293,7 +290,7 @@ def _set_up(data: Dataset, conf: Conf, extra_components: Iterable[Component]) ->
         groups=components.densification_groups(splat.densify),
         view_pixels=data.view_pixels,
     )
-    views = _Views(data.train)
+    views = _Views(data.train, backend)
     # After all preparation, since its clock starts here.
     recorder = TrainingRecorder(steps, splat.densify.grow_grad2d, data.train)
     sh_every = max(1, int(splat.sh_every * steps / NOMINAL_STEPS))

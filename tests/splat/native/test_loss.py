@@ -59,6 +59,27 @@ FUSED = [name for name in native.available_isas() if name != "portable"]
 SIZES = [(11, 11), (11, 30), (40, 13), (12, 16), (13, 32), (52, 67), (33, 64), (75, 133), (131, 65)]
 
 
+@pytest.mark.parametrize("threads", [1, 3])
+@pytest.mark.parametrize("size", [*SIZES, (43, 400)])  # more than one strip of 512 floats
+def test_a_photograph_has_the_moments_of_the_torch_backend(
+    isa: str, size: tuple[int, int], threads: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same bits: `Target` is then the same whatever the backend."""
+    _, photograph = pair(*size)
+    photograph[:3] = 0.3  # flat: the variance is rounding, or 0
+    photograph[4:6] += 1e4
+    photograph[-1, -1, 2] = float("nan")
+    expected = prepare_target(photograph)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
+    target = prepare_target(
+        photograph.permute(2, 0, 1).contiguous().permute(1, 2, 0), backend="native"
+    )
+    assert expected.variance[..., 2].isnan().any()
+    for name in ("image", "mean", "variance"):
+        bits = (getattr(of, name).view(torch.int32) for of in (target, expected))
+        assert torch.equal(*bits)
+
+
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize(
     ("l1", "ssim", "weighted"),
@@ -234,6 +255,8 @@ def test_types_and_shapes_are_checked() -> None:
     target = prepare_target(photograph)
     with pytest.raises(ValueError, match="image must be float32"):
         native_loss(image.double(), target)
+    with pytest.raises(ValueError, match="image must be float32"):
+        prepare_target(photograph.double(), backend="native")
     with pytest.raises(ValueError, match="target must be float32"):
         native_loss(image, prepare_target(photograph.double()))
     with pytest.raises(ValueError, match=r"image is \[19, 24, 3\], its target \[20, 24, 3\]"):

@@ -1,5 +1,5 @@
 // xrgs._native.photometric_loss: L1 and SSIM of an image against a target, and the gradient of the
-// loss.
+// loss. xrgs._native.window_moments: what it needs of the target.
 #include "loss/bind.h"
 
 #include <nanobind/nanobind.h>
@@ -12,6 +12,7 @@
 #include <vector>
 
 #include "loss/photometric.h"
+#include "loss/window_moments.h"
 #include "output_arrays.h"
 #include "thread_pool.h"
 
@@ -21,10 +22,12 @@ namespace xrgs {
 namespace {
 
 using Image = nb::ndarray<const float, nb::shape<-1, -1, 3>, nb::c_contig, nb::device::cpu>;
+using Window = nb::ndarray<const double, nb::shape<kWindow>, nb::c_contig, nb::device::cpu>;
 using PixelWeights = nb::ndarray<const float, nb::shape<-1, -1>, nb::c_contig, nb::device::cpu>;
 
 constexpr double kSigma = 1.5;    // of the window, px
 constexpr int kMinBandRows = 32;  // a band computes ten rows more than its own
+constexpr int kMomentRows = 32;   // of a task; those of the image that it reads stay in the cache
 
 // Sets the weights of a normalised Gaussian window.
 void set_window(float* window) {
@@ -97,6 +100,28 @@ nb::tuple photometric_loss(Image image, Image target, Image target_mean, Image t
   return nb::make_tuple(loss, gradient);
 }
 
+nb::tuple window_moments(Image image, Window window, int threads) {
+  const std::size_t height = image.shape(0), width = image.shape(1);
+  if (height < kWindow || width < kWindow)
+    throw nb::value_error("window_moments: image must be [H, W, 3] of at least 11 x 11 px");
+  const std::size_t map_height = height - kMapShrink;
+  Output mean = new_array<float>({map_height, width - kMapShrink, 3});
+  Output variance = new_array<float>({map_height, width - kMapShrink, 3});
+  const WindowMomentsJob job{
+      image.data(),  static_cast<int>(height),         static_cast<int>(width),
+      window.data(), static_cast<float*>(mean.data()), static_cast<float*>(variance.data())};
+  {
+    nb::gil_scoped_release release;
+    const WindowMomentsKernels& kernels = XRGS_SELECT(window_moments_kernels);
+    const int rows = static_cast<int>(map_height);
+    parallel_for(threads, (rows + kMomentRows - 1) / kMomentRows, [&](std::int64_t task) {
+      const int first = static_cast<int>(task) * kMomentRows;
+      kernels.rows(job, first, rows - first < kMomentRows ? rows : first + kMomentRows);
+    });
+  }
+  return nb::make_tuple(mean, variance);
+}
+
 }  // namespace
 
 void bind_loss(nb::module_& m) {
@@ -111,6 +136,11 @@ void bind_loss(nb::module_& m) {
       "image and target are [H, W, 3]; target_mean and target_variance [H - 10, W - 10, 3] are\n"
       "the target's under the window; pixel_weight [H, W] has the weight w of each pixel, and of\n"
       "the window around it, and None weighs all of them 1.");
+  m.def("window_moments", &window_moments, nb::arg("image").noconvert(),
+        nb::arg("window").noconvert(), nb::arg("threads"),
+        "Return the mean and the variance of an image [H, W, 3] under a window: [H - 10, W - 10, "
+        "3] each.\n\n"
+        "window [11] has the weights along one axis, in double.");
 }
 
 }  // namespace xrgs

@@ -1,4 +1,4 @@
-"""The photometric loss by the compiled kernel: value and gradient in one pass over the image."""
+"""The photometric loss by compiled kernels: value and gradient in one pass over the image."""
 
 from __future__ import annotations
 
@@ -9,7 +9,30 @@ from torch import Tensor
 
 from xrgs import _native
 from xrgs.splat.native.arguments import handle, require_float32
-from xrgs.splat.ssim import Target
+from xrgs.splat.ssim import WEIGHTS, Target
+
+_WINDOW = torch.tensor(WEIGHTS, dtype=torch.float64)
+
+
+def target_moments(image: Tensor) -> tuple[Tensor, Tensor]:
+    """Return `xrgs.splat.torch.loss.target_moments`, with the same bits for any number of threads.
+
+    Moments below 1.2e-38 are zero.
+
+    Args:
+        image: [H, W, 3], float32 on the CPU, contiguous.
+
+    Returns:
+        Mean and variance, [H - 10, W - 10, 3] each.
+
+    Raises:
+        ValueError: `image` is not float32 on the CPU.
+    """
+    require_float32("image", image)
+    moments: tuple[Tensor, Tensor] = _native.window_moments(
+        handle(image), handle(_WINDOW), torch.get_num_threads()
+    )
+    return moments
 
 
 def photometric_loss(

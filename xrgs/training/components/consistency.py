@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from xrgs.errors import XrgsError
-from xrgs.runtime.machine import single_torch_thread
 from xrgs.splat.loss import WINDOW, Target, photometric_loss, prepare_target
 from xrgs.splat.resample import resize
 from xrgs.training.components.base import (
@@ -136,8 +135,7 @@ class Consistency(Component):
     def _paired_target(self, view: TrainingView) -> Target:
         """The photograph of a view at the opposite resolution."""
         image = resize(view.image, *self.sizes[view.name], backend=self.backend)
-        with single_torch_thread():  # as the loop prepares photographs
-            return prepare_target(image)
+        return prepare_target(image, backend=self.backend)
 
 
 def _opposite_size(view: TrainingView, factor: int, hr_long_side: float) -> tuple[int, int]:
