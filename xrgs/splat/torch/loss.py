@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from xrgs.runtime.machine import single_torch_thread
 from xrgs.splat.ssim import C1, C2, WINDOW, Target, window_mean, window_moments
 
 #: Rows of windows whose moments are computed at once. At 1,008 px they stay in the processor's
@@ -24,13 +23,11 @@ def target_moments(image: Tensor) -> tuple[Tensor, Tensor]:
     """
     height, width = image.shape[:2]
     mean, variance = (image.new_empty(height - WINDOW + 1, width - WINDOW + 1, 3) for _ in range(2))
-    # More threads are slower where another program has a core, since the blocks of rows are small.
-    with single_torch_thread():
-        for row in range(0, len(mean), _ROWS):
-            rows = slice(row, row + _ROWS)
-            # In double, since a variance is a small difference of squares.
-            moments = window_moments(image[row : row + _ROWS + WINDOW - 1].double())
-            mean[rows], variance[rows] = moments
+    for row in range(0, len(mean), _ROWS):
+        rows = slice(row, row + _ROWS)
+        # In double, since a variance is a small difference of squares.
+        moments = window_moments(image[row : row + _ROWS + WINDOW - 1].double())
+        mean[rows], variance[rows] = moments
     return mean, variance
 
 
