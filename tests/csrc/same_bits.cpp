@@ -358,16 +358,16 @@ void window_moments(int threads, const Floats& image) {
   double window[xrgs::kWindow];
   for (int tap = 0; tap < xrgs::kWindow; ++tap)
     window[tap] = kWindowWeights[std::abs(tap - xrgs::kWindow / 2)];
-  Target target = make_target(image);
-  const xrgs::WindowMomentsJob job{
-      image.data(), kHeight, kWidth, window, target.mean.data(), target.variance.data()};
+  Floats mean(size_of(3 * kMapWidth * kMapHeight)), variance(mean.size());
+  const xrgs::WindowMomentsJob job{image.data(), kHeight,     kWidth,
+                                   window,       mean.data(), variance.data()};
   parallel_for(threads, kMapHeight, [&](std::int64_t task) {
     const int row = static_cast<int>(task);
     XRGS_SELECT(window_moments_kernels).rows(job, row, row + 1);
   });
   Hash hash;
-  hash.add(target.mean);
-  hash.add(target.variance);
+  hash.add(mean);
+  hash.add(variance);
   hash.print("window-moments");
 }
 
