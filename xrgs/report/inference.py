@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.special import bdtr, stdtr, stdtrit
-from scipy.stats import false_discovery_control
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -257,5 +256,8 @@ def false_discovery_rates(p: Floats) -> Floats:
     q = np.full_like(p, np.nan)
     tested = ~np.isnan(p)
     if tested.any():
+        # Not at the top: the import takes 0.7 s, and a report of one replicate has no tests.
+        from scipy.stats import false_discovery_control
+
         q[tested] = false_discovery_control(p[tested])
     return q
