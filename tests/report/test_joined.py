@@ -97,7 +97,8 @@ def test_two_different_cells_in_one_place_are_refused(
     store = Store(b)
     rows = [msgspec.structs.replace(row, scene="fern") for row in store.sweep_record(second).cells]
     other = store.write_sweep([], rows)
-    with pytest.raises(ReportError, match=rf"fern / baseline / seed 0 is cell .*{first} and"):
+    message = rf"fern / baseline / seed 0 is cell .*{first} and.* both as an axis"
+    with pytest.raises(ReportError, match=message):
         build(b, [first, other], pictures=[])
 
 
