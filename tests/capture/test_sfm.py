@@ -11,6 +11,7 @@ import pycolmap
 import pytest
 
 from xrgs.capture import images, scenes, sfm
+from xrgs.capture.alignment import pose_error
 from xrgs.capture.scenes import motorcycle
 from xrgs.capture.scenes.scene import bundled_photograph
 from xrgs.config import Conf, SceneConf, SfmConf
@@ -136,9 +137,9 @@ def test_its_points_lie_at_the_depths_of_the_published_disparity(stereo_pair: St
 def test_any_number_of_threads_gives_the_same_cameras(
     compose: Callable[..., Conf], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Other draws of RANSAC or other numbers of the images move cameras by 6% of the scene or more.
+    """Other draws of RANSAC move a camera by 0.036% of the scene, another order of images by 0.17%.
 
-    One run of some 90 moved them by 0.01%, for a reason inside COLMAP.
+    One run of some 90 had other last digits, for a reason inside COLMAP.
     """
     conf = compose("scene=procedural", "scene.views=6")
     rendered = scenes.resolve(conf.scene, tmp_path, 320).files.values()
@@ -153,12 +154,8 @@ def test_any_number_of_threads_gives_the_same_cameras(
         models.append(sfm.reconstruct(inputs, work, work, conf.variant.sfm))
     one, three = models
     assert one.report["registered"] == 6
-    centers = [
-        np.array([-model.viewmats[i][:3, :3].T @ model.viewmats[i][:3, 3] for i in range(6)])
-        for model in models
-    ]
-    extent = np.linalg.norm(centers[0] - centers[0].mean(0), axis=1).max()
-    assert np.abs(centers[1] - centers[0]).max() < 1e-3 * extent
+    first, second = ({str(i): pose for i, pose in model.viewmats.items()} for model in models)
+    assert pose_error(second, first)["position_percent_max"] < 0.01
     assert three.lenses[0].params[0] == pytest.approx(one.lenses[0].params[0], rel=1e-4)
 
 

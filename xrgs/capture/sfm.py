@@ -110,7 +110,7 @@ def reconstruct(
     """Find cameras and points by exhaustive matching and incremental mapping.
 
     With any number of threads, images have the same numbers and RANSAC makes the same draws. Some
-    90 runs with 1 to 8 threads on one kind of processor gave the same bits. One other run did not:
+    90 runs with 1 and 3 threads on one kind of processor gave the same bits. One other run did not:
     its focal length differed by 1/100,000, for a reason inside COLMAP that was not found. Another
     kind of processor may give other last digits.
 
