@@ -206,7 +206,8 @@ def _same(known: tuple[str, RecordedCell] | None, sweep_id: str, row: RecordedCe
         f"{name} / seed {row.seed} is cell {first.cell_id} in sweep {before} and"
         f" {row.cell_id} in sweep {sweep_id}: they differ in configuration, code or variant."
         " Leave one of the sweeps out, or choose rows with --scenes and --ablations. To compare two"
-        " values of a setting, run xrgs-sweep with both as an axis: no finished cell is trained again"
+        " values of a setting, run xrgs-sweep with both as an axis: finished cells are not trained"
+        " again"
     )
 
 
