@@ -112,14 +112,7 @@ class Client:
             asyncio.run(callback(self.camera))
 
 
-@pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
-    now = SimpleNamespace(s=100.0)
-    monkeypatch.setattr("xrgs.viewer.live.time.monotonic", lambda: now.s)
-    return now
-
-
-def test_the_camera_that_is_moved_moves_the_others(clock: SimpleNamespace) -> None:
+def test_the_camera_that_is_moved_moves_the_others() -> None:
     shared, clients = live._SharedCamera(None), [Client(), Client()]
     for client in clients:
         shared.join(client)
@@ -127,21 +120,22 @@ def test_the_camera_that_is_moved_moves_the_others(clock: SimpleNamespace) -> No
     first.camera.fov = 0.5
     first.move(1.0)
     assert (second.camera.position[0], second.camera.fov) == (1.0, 0.5)
-    clock.s += 0.1
     first.move(2.0)
     second.move(1.0)  # the second browser reports where it was told to be a moment ago
     second.move(2.0)
     assert first.camera.position[0] == 2.0, "which is no move of the user"
-    clock.s += 1.0
     second.move(7.0)
     assert first.camera.position[0] == 7.0
+    first.move(7.0)
+    first.move(1.0)
+    assert second.camera.position[0] == 1.0, "a place that was told before is one to move to"
     shared.leave(first)
-    clock.s += 1.0
     second.move(8.0)
-    assert first.camera.position[0] == 7.0
+    first.move(9.0)
+    assert (first.camera.position[0], second.camera.position[0]) == (9.0, 8.0)
 
 
-def test_places_are_set_together(clock: SimpleNamespace) -> None:
+def test_places_are_set_together() -> None:
     opened = []
 
     @contextmanager
@@ -158,7 +152,7 @@ def test_places_are_set_together(clock: SimpleNamespace) -> None:
     assert opened == ["begin", "end"]
 
 
-def test_a_frame_that_is_opened_takes_the_place_of_the_others(clock: SimpleNamespace) -> None:
+def test_a_frame_that_is_opened_takes_the_place_of_the_others() -> None:
     place = {"position": np.ones(3), "look_at": np.zeros(3), "up_direction": np.ones(3), "fov": 0.5}
     shared, first, second = live._SharedCamera(place), Client(), Client()
     shared.join(first)
@@ -166,11 +160,13 @@ def test_a_frame_that_is_opened_takes_the_place_of_the_others(clock: SimpleNames
     assert np.array_equal(second.camera.position, np.ones(3))
     first.move(3.0)  # what its browser reports from before it was put to its place
     assert np.array_equal(second.camera.position, np.ones(3))
+    assert np.array_equal(first.camera.position, np.ones(3)), "it is told again"
     for client in (first, second):
         client.report(np.ones(3))
-    clock.s += 1.0
     second.move(7.0)
     assert first.camera.position[0] == 7.0
+    first.report(np.ones(3))  # a report from before it followed, which came late
+    assert second.camera.position[0] == 7.0
 
 
 @pytest.mark.slow

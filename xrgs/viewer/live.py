@@ -11,7 +11,7 @@ import html
 import io
 import math
 import threading
-import time
+from collections import deque
 from contextlib import ExitStack, contextmanager, redirect_stdout
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import TYPE_CHECKING, Any
@@ -41,10 +41,11 @@ NOT_ANTIALIASED = (
     "in xrgs-render and in the report"
 )
 """What is said of an antialiased model."""
-#: A camera that follows the user's reports its new place within so many seconds.
-_ECHO_S = 0.3
-#: A camera has arrived where it is this near to its place, world units.
-_NEAR = 1e-3
+#: So many places that a camera was told to take are remembered until it reports them.
+_REMEMBERED = 1000
+#: A browser reports a place this near to the one that it was told, as a share of the distance
+#: from the camera to the point that it looks at.
+_ROUNDING = 1e-4
 #: The attributes of viser's cameras that make up a place.
 _PLACE = ("position", "look_at", "up_direction", "fov")
 #: The size of a drawn camera, as a share of the cameras' median distance from what they look at.
@@ -235,54 +236,63 @@ def _go_to(event: Any) -> None:
 class _SharedCamera:
     """Lets the cameras of all frames follow the one that the user moves.
 
-    A camera that follows reports its new place just as the leading one does. So one camera leads
-    at a time, and another can lead once the leader has been at rest for a moment. A frame that
-    opens reports a place of the browser's own choice first. It can lead once it has reported the
-    place that it was put to.
+    A camera that follows reports its new place just as one that the user moves does. So a report
+    of a place that the camera was told to take is no move of the user, however late it comes. A
+    frame that opens reports places of the browser's own choice first. So it is told its place
+    again until it has reported one that it was told.
     """
 
     def __init__(self, start: _Place | None) -> None:
         self._lock = threading.Lock()
         self._place = start
-        self._clients: list[ClientHandle] = []
-        self._arrived: list[ClientHandle] = []
-        self._leader: ClientHandle | None = None
-        self._led_at = -_ECHO_S
+        self._told: dict[ClientHandle, deque[_Place]] = {}
+        self._arrived: set[ClientHandle] = set()
 
     def join(self, client: ClientHandle) -> None:
         """Let a frame's camera follow and lead."""
         with self._lock:
-            self._clients.append(client)
+            self._told[client] = deque(maxlen=_REMEMBERED)
             if self._place is not None:
-                _put(client, self._place)
+                self._tell(client, self._place)
         client.camera.on_update(self._moved)
 
     def leave(self, client: ClientHandle) -> None:
         """Forget a frame that was closed."""
         with self._lock:
-            for clients in (self._clients, self._arrived):
-                if client in clients:
-                    clients.remove(client)
+            self._told.pop(client, None)
+            self._arrived.discard(client)
 
     async def _moved(self, camera: CameraHandle) -> None:
+        place, client = {name: getattr(camera, name) for name in _PLACE}, camera.client
         with self._lock:
-            now, client = time.monotonic(), camera.client
-            if client not in self._arrived:
-                if self._place and not np.allclose(
-                    camera.position, self._place["position"], atol=_NEAR
-                ):
-                    return
-                self._arrived.append(client)
-            if self._leader is not client and now - self._led_at < _ECHO_S:
+            told = self._told.get(client)
+            if told is None:
                 return
-            self._leader, self._led_at = client, now
-            self._place = {name: getattr(camera, name) for name in _PLACE}
-            for other in self._clients:
-                if other is not client:
-                    _put(other, self._place)
+            if any(_same(place, known) for known in told):
+                self._arrived.add(client)
+                while not _same(place, told[0]):
+                    told.popleft()
+            elif self._place is None or client in self._arrived:
+                self._arrived.add(client)
+                self._place = place
+                told.clear()
+                for other in self._told:
+                    if other is not client:
+                        self._tell(other, place)
+            else:
+                self._tell(client, self._place)
+
+    def _tell(self, client: ClientHandle, place: _Place) -> None:
+        self._told[client].append(place)
+        with client.atomic():
+            for name in _PLACE:
+                setattr(client.camera, name, place[name])
 
 
-def _put(client: ClientHandle, place: _Place) -> None:
-    with client.atomic():
-        for name in _PLACE:
-            setattr(client.camera, name, place[name])
+def _same(first: _Place, second: _Place) -> bool:
+    """Return whether two places differ by no more than a browser's rounding."""
+    near = _ROUNDING * np.linalg.norm(np.subtract(first["position"], first["look_at"]))
+    return all(
+        np.allclose(first[name], second[name], rtol=0, atol=near)
+        for name in ("position", "look_at")
+    )
