@@ -266,13 +266,13 @@ class _SharedCamera:
         place, client = {name: getattr(camera, name) for name in _PLACE}, camera.client
         with self._lock:
             told = self._told.get(client)
-            if told is None:
+            if told is None:  # it has left
                 return
-            if any(_same(place, known) for known in told):
+            if any(_same(place, known) for known in told):  # it follows
                 self._arrived.add(client)
                 while not _same(place, told[0]):
                     told.popleft()
-            elif self._place is None or client in self._arrived:
+            elif self._place is None or client in self._arrived:  # the user moved it
                 self._arrived.add(client)
                 self._place = place
                 told.clear()
