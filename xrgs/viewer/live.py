@@ -292,7 +292,4 @@ class _SharedCamera:
 def _same(first: _Place, second: _Place) -> bool:
     """Return whether two places differ by no more than a browser's rounding."""
     near = _ROUNDING * np.linalg.norm(np.subtract(first["position"], first["look_at"]))
-    return all(
-        np.allclose(first[name], second[name], rtol=0, atol=near)
-        for name in ("position", "look_at")
-    )
+    return all(np.allclose(first[name], second[name], rtol=0, atol=near) for name in _PLACE)
