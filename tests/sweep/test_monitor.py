@@ -157,6 +157,18 @@ def test_past_cells_decide_at_first_and_the_own_pace_in_the_end(watched: Watched
         assert replace(snapshot, slowness=1.0).rest_s(running) == pytest.approx(seconds)
 
 
+def test_of_a_cell_that_waits_to_be_resumed_the_rest_is_expected(watched: Watched) -> None:
+    monitor = SweepMonitor(watched.store.cells_folder)
+    monitor.watch([replace(watched.plan("a", "unfinished", 100.0, scoring=20.0), trained=0.75)])
+    assert monitor.snapshot().left_s == 40
+    watched.begin("other")
+    watched.step("other", 0, 10.0)
+    other = watched.plan("other")
+    monitor.watch([replace(watched.plan("a", "unfinished"), trained=0.75), other])
+    # 100 steps of the other cell, 25 of this one
+    assert monitor.snapshot().left_s == pytest.approx(12.5)
+
+
 def test_a_log_has_a_line_when_a_cell_ends_and_the_last_at_the_end(
     watched: Watched, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -247,3 +247,33 @@ def test_a_cell_whose_lease_is_held_is_running_unless_it_is_done(
     assert identified(one, cells.store, {}).state.name == "unfinished"
     cells.finish(own)
     assert identified(one, cells.store, {"a": "process 1"}).state.name == "done"
+
+
+@pytest.mark.parametrize(
+    ("history", "checkpoint", "left"),
+    [
+        ("step,loss\n0,0.5\n29,0.1\n", True, 40.0),  # 30 of 40 steps in 80 s, then 20 s of scoring
+        ("step,loss\n0,0.5\n29,0.1\n", False, 100.0),
+        (None, True, 100.0),
+        ("step,loss\n0,0.5\n2", True, 100.0),
+        ("loss\n0.5\n", True, 100.0),
+        ("step,loss\n", True, 100.0),
+        ("step,loss\nlast,0.5\n", True, 100.0),
+    ],
+)
+def test_what_a_checkpoint_has_is_not_left_to_train(
+    cell: Callable[..., PlannedCell],
+    cells: Any,
+    history: str | None,
+    checkpoint: bool,
+    left: float,
+) -> None:
+    own = cells.begin("a")
+    own.checkpoint.unlink(missing_ok=True)
+    if checkpoint:
+        own.checkpoint.touch()
+    if history is not None:
+        (own.path / "history.csv").write_text(history)
+    cost = Cost(100.0, 20.0, 1e9, 1e6)
+    one = replace(cell("a", steps=40), identity=own.identity(), cost=cost)
+    assert identified(one, cells.store, {}).seconds == left

@@ -123,6 +123,20 @@ class CellFolder:
             return CellState("planned", "it has not begun")
         return CellState("unfinished", "it was stopped before it ended")
 
+    def steps_to_resume(self) -> int:
+        """Return about how many steps an unfinished cell need not repeat: its checkpoint has them.
+
+        They are counted in the history, which is written as the training goes on; 0 where the cell
+        has no checkpoint or its history can't be read.
+        """
+        if not self.checkpoint.exists():
+            return 0
+        try:
+            header, rows = read_table(self.path / "history.csv")
+            return int(dict(zip(header, rows[-1], strict=True))["step"]) + 1
+        except (StoreError, LookupError, ValueError):
+            return 0
+
     def running(self, owner: str) -> CellState:
         """Return the state of a cell whose lease the described process holds."""
         now = progress.read(self.progress)

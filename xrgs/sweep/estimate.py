@@ -87,6 +87,10 @@ class Cost:
     disk_bytes: float
     """Size of its files when it is done."""
 
+    def left_s(self, trained: float) -> float:
+        """Return the seconds to the end of a cell, with this share of its training done."""
+        return (1 - trained) * (self.seconds - self.scoring_s) + self.scoring_s
+
 
 @dataclass(frozen=True)
 class _Finished:

@@ -98,7 +98,8 @@ class SweepSnapshot:
     @property
     def left_s(self) -> float | None:
         """Expected seconds left, if as many cells run at once as did so far; None if unknown."""
-        own = [*map(self.whole_s, self.waiting), *map(self.rest_s, self.running)]
+        waiting = (self.expected_s(cell, cell.trained) for cell in self.waiting)
+        own = [*waiting, *map(self.rest_s, self.running)]
         known = [seconds for seconds in own if seconds is not None]
         if len(known) < len(own):
             return None
@@ -106,21 +107,25 @@ class SweepSnapshot:
         longest = max([*known, *others], default=None)
         return longest and max(longest, sum(known) / self.at_once)
 
-    def whole_s(self, cell: PlannedCell) -> float | None:
-        """Return the expected seconds of a cell from its start to its end; None if unknown."""
+    def expected_s(self, cell: PlannedCell, trained: float) -> float | None:
+        """Return the expected seconds of a cell to its end; None if unknown.
+
+        Args:
+            cell: The cell.
+            trained: The share of its training that is done, 0 to 1.
+        """
         if cell.cost is not None:
-            return cell.cost.seconds * self.slowness
-        return None if self.pace is None else cell.conf.train.steps * self.pace
+            return cell.cost.left_s(trained) * self.slowness
+        return None if self.pace is None else (1 - trained) * cell.conf.train.steps * self.pace
 
     def rest_s(self, running: RunningCell) -> float | None:
         """Return the expected seconds to the end of a running cell; None if unknown."""
-        cost, whole = running.cell.cost, self.whole_s(running.cell)
-        scoring = cost.scoring_s * self.slowness if cost else 0.0
-        past = None if whole is None else (1 - running.share) * (whole - scoring) + scoring
+        cost, past = running.cell.cost, self.expected_s(running.cell, running.share)
         own = running.progress.remaining_s if running.trains else None
         if own is None or past is None or cost is None:
             return past if own is None else own
         # A cell's own pace says little at first, when it has few Gaussians, and all at the end.
+        scoring = cost.scoring_s * self.slowness
         return (1 - running.share) * past + running.share * (own + scoring)
 
     def __str__(self) -> str:

@@ -45,6 +45,8 @@ class PlannedCell:
     """The cell's id is the digest of it; None while the variant or a count is missing."""
     cell_id: str | None = None
     state: CellState = field(default_factory=lambda: CellState("absent"))
+    trained: float = 0.0
+    """The share of its training that need not be repeated, 0 to 1: its checkpoint has it."""
     error: str | None = None
     """Why the cell can't be trained: its scene or its reference failed."""
     remembered: bool = False
@@ -54,8 +56,8 @@ class PlannedCell:
 
     @property
     def seconds(self) -> float | None:
-        """Expected seconds from its start to its end; None if unknown."""
-        return self.cost.seconds if self.cost else None
+        """Expected seconds that are left to its end; None if unknown."""
+        return self.cost.left_s(self.trained) if self.cost else None
 
     @property
     def name(self) -> str:
@@ -151,10 +153,12 @@ def identified(cell: PlannedCell, store: Store, holders: Mapping[str, str]) -> P
         return cell
     identity = cell.identity or cell_identity(cell.conf, cell.variant_id)
     name = cell.cell_id or cell_id(identity)
-    state = store.cell(name).state()
+    folder = store.cell(name)
+    state = folder.state()
     if state.name != "done" and name in holders:
-        state = store.cell(name).running(holders[name])
-    return replace(cell, identity=identity, cell_id=name, state=state)
+        state = folder.running(holders[name])
+    trained = folder.steps_to_resume() / cell.conf.train.steps if state.name == "unfinished" else 0
+    return replace(cell, identity=identity, cell_id=name, state=state, trained=trained)
 
 
 def estimated(plan: Sequence[PlannedCell], past: CostEstimator, threads: int) -> list[PlannedCell]:
@@ -251,7 +255,7 @@ def without_kernels(plan: Sequence[PlannedCell]) -> str:
     ]
     if not cells:
         return ""
-    known = [cell.cost.seconds for cell in cells if cell.cost]
+    known = [cell.seconds for cell in cells if cell.seconds is not None]
     torch, native = (format_duration(sum(known) / ratio) for ratio in (1.0, TORCH_SLOWDOWN))
     complete = len(known) == len(cells)
     instead = f"{torch} instead of {native}" if complete else "30 to 60 times longer"
@@ -321,7 +325,7 @@ def left_to_train(plan: Sequence[PlannedCell]) -> list[PlannedCell]:
 def _remaining(plan: Sequence[PlannedCell]) -> str:
     """Return the expected time of the remaining training, as far as known."""
     remaining = left_to_train(plan)
-    known = [cell.cost.seconds for cell in remaining if cell.cost]
+    known = [cell.seconds for cell in remaining if cell.seconds is not None]
     if not known:
         return ""
     unknown = len(remaining) - len(known)
