@@ -269,7 +269,6 @@ def test_what_a_checkpoint_has_is_not_left_to_train(
     left: float,
 ) -> None:
     own = cells.begin("a")
-    own.checkpoint.unlink(missing_ok=True)
     if checkpoint:
         own.checkpoint.touch()
     if history is not None:
@@ -277,3 +276,6 @@ def test_what_a_checkpoint_has_is_not_left_to_train(
     cost = Cost(100.0, 20.0, 1e9, 1e6)
     one = replace(cell("a", steps=40), identity=own.identity(), cost=cost)
     assert identified(one, cells.store, {}).seconds == left
+    own.fail("it raised")  # retry=failed resumes it too
+    failed = identified(one, cells.store, {})
+    assert (failed.state.name, failed.seconds) == ("failed", left)

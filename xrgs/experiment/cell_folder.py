@@ -124,7 +124,7 @@ class CellFolder:
         return CellState("unfinished", "it was stopped before it ended")
 
     def steps_to_resume(self) -> int:
-        """Return about how many steps an unfinished cell need not repeat: its checkpoint has them.
+        """Return about how many steps the next attempt need not repeat: the checkpoint has them.
 
         They are counted in the history, which is written as the training goes on; 0 where the cell
         has no checkpoint or its history can't be read.

@@ -157,7 +157,7 @@ def identified(cell: PlannedCell, store: Store, holders: Mapping[str, str]) -> P
     state = folder.state()
     if state.name != "done" and name in holders:
         state = folder.running(holders[name])
-    trained = folder.steps_to_resume() / cell.conf.train.steps if state.name == "unfinished" else 0
+    trained = folder.steps_to_resume() / cell.conf.train.steps
     return replace(cell, identity=identity, cell_id=name, state=state, trained=trained)
 
 
