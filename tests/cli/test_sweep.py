@@ -20,7 +20,7 @@ RunCommand = Callable[..., tuple[int, str, str]]
 SCENE = ("scene=motorcycle", "preset=smoke", "store=s")
 SWEEPS = CONF_DIR / "sweeps" if (CONF_DIR / "sweeps").is_dir() else CONF_DIR.parent / "sweeps"
 #: The sweeps that have every ablation between them.
-WHOLE = ("ablations", "recipes", "further_ablations", "paper_size")
+WHOLE = ("ablations", "readings", "recipes", "arms", "paper_size")
 
 
 def arms(sweep: str) -> set[str]:
