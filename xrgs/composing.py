@@ -91,7 +91,6 @@ def to_conf(cfg: DictConfig) -> Conf:
 def _check_ranges(conf: Conf) -> None:
     """Raise `XrgsError` where a number is out of its range; the message names its key."""
     least_values = (
-        ("splat.optimizer.means_decay_from", conf.splat.optimizer.means_decay_from, 0),
         ("splat.optimizer.shN_every", conf.splat.optimizer.shN_every, 1),
         ("seed", conf.seed, 0),
         ("variant.seed", conf.variant.seed, 0),
@@ -108,9 +107,15 @@ def _check_ranges(conf: Conf) -> None:
     for name in ("validation", "hr_share"):
         if not 0 <= (share := getattr(conf.train, name)) < 1:
             raise XrgsError(f"train.{name}={share}: must be from 0 to below 1")
-    if (begin := conf.splat.optimizer.means_decay_from) >= NOMINAL_STEPS:
-        key = "splat.optimizer.means_decay_from"
-        raise XrgsError(f"{key}={begin}: must be below {NOMINAL_STEPS}, the length of a run")
+    optimizer = conf.splat.optimizer
+    for name in ("means_decay_from", "length_decay_from"):
+        if not 0 <= (begin := getattr(optimizer, name)) < NOMINAL_STEPS:
+            raise XrgsError(
+                f"splat.optimizer.{name}={begin}: must be 0 or more and below {NOMINAL_STEPS}, the"
+                " length of a run"
+            )
+    if not 0 <= (power := optimizer.length_power) <= 1:
+        raise XrgsError(f"splat.optimizer.length_power={power}: must be from 0 to 1")
     if not (math.isfinite(scale := conf.splat.init_scale) and scale > 0):
         raise XrgsError(f"splat.init_scale={scale}: must be finite and above 0")
     for name in ("budget", "noise"):

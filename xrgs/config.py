@@ -274,6 +274,7 @@ class NaturalSelectionConf:
 
     budget: float = off(0.0)
     until: int
+    drop_every: int = off(50)
 
 
 @dataclass(kw_only=True)

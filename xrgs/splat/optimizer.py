@@ -15,6 +15,9 @@ from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.splat.settings import NOMINAL_STEPS, OptimizerSettings
 
 _MOMENTS = ("exp_avg", "exp_avg_sq")
+LENGTH_GROUPS = ("scales", "quats", "sh0", "shN")
+"""The parameters whose rates `length_power` fits to the length of a run. Means have a schedule of
+their own, and a logit opacity moves far enough at gsplat's rate of 0.05."""
 
 
 class SplatOptimizer:
@@ -26,6 +29,18 @@ class SplatOptimizer:
 
     where t0 is `means_decay_from * steps / 30,000`, 0 in gsplat. DashGaussian [chen2025dash] lets
     the decay wait while it trains at a reduced resolution.
+
+    gsplat's rates are meant for 30,000 steps. Adam moves a log scale by about its rate at each step,
+    so that 600 steps at 0.005 change a scale by at most a factor of e^3, and the first scales, the
+    spacing of the SfM points, are often ten times too large. With `length_power` of p, the rates of
+    scales, quats, sh0 and shN in a run of T steps, T below 30,000, are
+
+        rate(t) = rate * (30,000 / T)^(p * min(1, (T - t) / (T - t1)))
+
+    where t1 is `length_decay_from * T / 30,000`: larger up to t1, then falling exponentially to
+    gsplat's own after the last step, so that the noise of large steps settles. In a run of 30,000
+    steps and more the factor is one. Our choice: the distance that noise carries a parameter grows
+    with rate^2 * steps, which p = 0.5 keeps, and reports/rates compares the powers.
 
     With `shN_every` of k, the harmonics above band 0 move at every k-th step alone, the first one
     included, by the gradient of that step, and at k times their rate. Their moments are updated at
@@ -81,18 +96,26 @@ class SplatOptimizer:
                 f"means_decay_from must be 0 or more and below {NOMINAL_STEPS}, got"
                 f" {settings.means_decay_from}"
             )
+        if not 0 <= settings.length_decay_from < NOMINAL_STEPS:
+            raise ValueError(
+                f"length_decay_from must be 0 or more and below {NOMINAL_STEPS}, got"
+                f" {settings.length_decay_from}"
+            )
+        if not 0 <= settings.length_power <= 1:
+            raise ValueError(f"length_power must be 0 to 1, got {settings.length_power}")
         if settings.shN_every < 1:
             raise ValueError(f"shN_every must be at least 1, got {settings.shN_every}")
         self.gaussians = gaussians
         self.settings = settings
         self.means_rate = settings.means * scene_scale
         self.means_decay_from = settings.means_decay_from * steps / NOMINAL_STEPS
+        self.length_factor = max(1.0, NOMINAL_STEPS / steps)
+        self.length_decay_from = settings.length_decay_from * steps / NOMINAL_STEPS
         self.steps = steps
         self.steps_done = 0
         self.backend = resolve_backend(backend)
         self.rates: dict[str, float] = {name: getattr(settings, name) for name in PARAMETERS}
-        self.rates["means"] = self.means_rate
-        self.rates["shN"] *= settings.shN_every
+        self._set_rates()
         self.adam: dict[str, dict[str, Tensor]] = {name: {} for name in PARAMETERS}
 
     def step(self, camera: Camera | None = None, *, sh_degree: int = 0) -> None:
@@ -132,12 +155,19 @@ class SplatOptimizer:
         Adam's moments and the number of its steps stay as they are.
         """
         self.steps_done += 1
-        self._decay_means_rate()
+        self._set_rates()
 
-    def _decay_means_rate(self) -> None:
+    def _set_rates(self) -> None:
+        """Set the rates of the next step."""
+        settings, left = self.settings, self.steps - self.steps_done
         decaying = max(0, self.steps_done - self.means_decay_from)
-        decay = self.settings.means_final ** (decaying / (self.steps - self.means_decay_from))
+        decay = settings.means_final ** (decaying / (self.steps - self.means_decay_from))
         self.rates["means"] = self.means_rate * decay
+        share_left = min(1.0, left / (self.steps - self.length_decay_from))
+        factor = self.length_factor ** (settings.length_power * share_left)
+        for name in LENGTH_GROUPS:
+            self.rates[name] = getattr(settings, name) * factor
+        self.rates["shN"] *= settings.shN_every
 
     def zero_grad(self) -> None:
         """Drop the gradients of all parameters."""
@@ -183,7 +213,7 @@ class SplatOptimizer:
             self.gaussians[name] = values[name].detach().requires_grad_()
             self.adam[name] = dict(adam[name])
         self.steps_done = int(state["steps_done"])
-        self._decay_means_rate()
+        self._set_rates()
 
     def keep(self, index: Tensor) -> None:
         """Remove all other Gaussians, with their moments.

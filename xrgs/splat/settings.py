@@ -103,6 +103,11 @@ class OptimizerSettings:
     shN: float = 2.5e-3 / 20  # noqa: N815
     shN_every: int = 1  # noqa: N815
     """Steps of this run between two steps of shN, whose rate is multiplied by it; 1 is gsplat's."""
+    length_power: float = off_by_default(0.0)
+    """The rates of scales, quats, sh0 and shN are multiplied by (30,000 / steps) to this power
+    (`SplatOptimizer`); 0 to 1. 0 keeps gsplat's, and so does a run of 30,000 steps and more."""
+    length_decay_from: int = off_by_default(18_000)
+    """Step of a 30,000-step run at which these rates begin to fall to gsplat's. Our choice."""
     beta1: float = 0.9
     """Decay of the first moment, per step."""
     beta2: float = 0.999

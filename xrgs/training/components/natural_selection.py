@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
 _LOGIT_OF_DEATH = math.log(0.001 / 0.999)
 """Gaussians with an opacity below 0.001 are removed [deng2025gns]."""
-_DROP_EVERY = 50
-"""Steps of a 30,000-step run between two removals [deng2025gns]."""
 _ADJUST_EVERY = 100
 """Steps of a 30,000-step run between two adjustments of the push [deng2025gns]."""
 _LEAD = 1_000
@@ -77,6 +75,7 @@ class NaturalSelection(Component):
             stop: Step of a 30,000-step run at which densification ends.
         """
         self.budget, self.start, self.until = budget, stop, settings.until
+        self.drop_every = settings.drop_every
         self.push = 0.0
         """g, in units of the gradient; 0 before the first step of the selection."""
         self.first_opacity = 0.0
@@ -89,12 +88,16 @@ class NaturalSelection(Component):
         """Build the component; a `budget` of 0 leaves it off.
 
         Raises:
-            XrgsError: The budget is below 0, or the selection would end before densification does
-                or after the run.
+            XrgsError: The budget is below 0, `drop_every` below 1, or the selection would end
+                before densification does or after the run.
         """
         check_not_negative("components.natural_selection.budget", settings.budget)
         if settings.budget == 0:
             return None
+        if settings.drop_every < 1:
+            raise XrgsError(
+                f"components.natural_selection.drop_every={settings.drop_every}: must be at least 1"
+            )
         stop = setup.splat.densify.stop
         if not stop + _LEAD < settings.until <= NOMINAL_STEPS:
             raise XrgsError(
@@ -133,7 +136,7 @@ class NaturalSelection(Component):
         if self.done or step.nominal < self.start or excess <= 0:
             return None
         self.done = step.nominal >= self.until or len(gaussians) <= _CLOSE * self.budget
-        if not (self.done or _is_due(step, _DROP_EVERY)):
+        if not (self.done or _is_due(step, self.drop_every)):
             return None
         logits = gaussians.opacities.detach()
         lowest = torch.zeros(len(gaussians), dtype=torch.bool)
