@@ -199,7 +199,6 @@ def test_a_value_that_is_missing_is_named(compose: Compose) -> None:
 @pytest.mark.parametrize(
     "override",
     [
-        "splat.optimizer.means_decay_from=-1",
         "splat.optimizer.shN_every=0",
         "train.steps=0",
         "threads=-1",
@@ -211,6 +210,19 @@ def test_a_value_that_is_missing_is_named(compose: Compose) -> None:
 def test_a_value_below_its_least_names_its_key(compose: Compose, override: str) -> None:
     with pytest.raises(XrgsError, match=rf"^{override.partition('=')[0]}=.*: must be at least"):
         compose(override)
+
+
+@pytest.mark.parametrize("value", [-1, 30_000])
+@pytest.mark.parametrize("key", ["means_decay_from", "length_decay_from"])
+def test_a_decay_begins_within_the_run(compose: Compose, key: str, value: int) -> None:
+    with pytest.raises(XrgsError, match=rf"^splat.optimizer.{key}={value}: must be 0 or more"):
+        compose(f"splat.optimizer.{key}={value}")
+
+
+@pytest.mark.parametrize("power", ["-0.1", "1.5", "nan"])
+def test_the_power_of_a_runs_length_has_a_range(compose: Compose, power: str) -> None:
+    with pytest.raises(XrgsError, match=r"^splat.optimizer.length_power=.*: must be from 0 to 1"):
+        compose(f"splat.optimizer.length_power={power}")
 
 
 @pytest.mark.parametrize("name", ["validation", "hr_share"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from math import inf, nan
 from typing import Any
 
@@ -116,6 +117,47 @@ def test_the_decay_of_the_rate_of_means_may_wait() -> None:
     assert rates == pytest.approx(waiting + [3.2e-4 * 0.01 ** (s / 15) for s in range(1, 16)])
 
 
+def rates_over_a_run(steps: int, settings: OptimizerSettings) -> Tensor:
+    """The rates of scales, quats, sh0, shN, means and opacities before each step, [steps, 6]."""
+    names = ("scales", "quats", "sh0", "shN", "means", "opacities")
+    optimizer = optimizer_of(steps=steps, settings=settings)
+    rows = []
+    for _ in range(steps):
+        rows.append([optimizer.rates[name] for name in names])
+        optimizer.skip_step()
+    return torch.tensor(rows, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("power", [0.5, 1.0])
+@pytest.mark.parametrize("steps", [1, 7, 600, 30_000])
+def test_the_rates_fit_the_length_of_a_run(steps: int, power: float) -> None:
+    """Against the formula: constant for six tenths of the run, then exponentially to gsplat's."""
+    found = rates_over_a_run(steps, OptimizerSettings(length_power=power))
+    plain = rates_over_a_run(steps, OptimizerSettings())
+    done = torch.arange(steps, dtype=torch.float64) / steps
+    first, last = math.log(30_000 / steps) * power, 0.0
+    logarithm = torch.where(done < 0.6, first, first + (last - first) * (done - 0.6) / 0.4)
+    expected = logarithm.exp()[:, None] * plain[:, :4]
+    torch.testing.assert_close(found[:, :4], expected, rtol=1e-12, atol=0)
+    assert torch.equal(found[:, 4:], plain[:, 4:])  # means and opacities as they are
+
+
+def test_a_long_run_has_gsplats_rates_to_the_bit() -> None:
+    for steps in (30_000, 30_001):
+        fitted = rates_over_a_run(steps, OptimizerSettings(length_power=0.5))
+        assert torch.equal(fitted, rates_over_a_run(steps, OptimizerSettings()))
+
+
+def test_fitted_rates_go_on_after_a_checkpoint() -> None:
+    settings = OptimizerSettings(length_power=0.5, length_decay_from=10_000)
+    one = optimizer_of(steps=9, settings=settings)
+    for seed in range(7):
+        take_step(one, seed)
+    other = optimizer_of(steps=9, settings=settings)
+    other.load_state_dict(one.state_dict())
+    assert other.rates == one.rates != optimizer_of(steps=9, settings=settings).rates
+
+
 def test_a_skipped_step_moves_nothing_and_the_rate_goes_on() -> None:
     skipping, other = optimizer_of(steps=8), optimizer_of(steps=8)
     take_step(skipping, 1)
@@ -152,9 +194,18 @@ def test_the_harmonics_move_at_every_third_step(backend: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("means_decay_from", -1), ("means_decay_from", 30_000), ("shN_every", 0)]
+    ("name", "value"),
+    [
+        ("means_decay_from", -1),
+        ("means_decay_from", 30_000),
+        ("length_decay_from", -1),
+        ("length_decay_from", 30_000),
+        ("length_power", -0.1),
+        ("length_power", nan),
+        ("shN_every", 0),
+    ],
 )
-def test_schedules_without_meaning_are_refused(name: str, value: int) -> None:
+def test_schedules_without_meaning_are_refused(name: str, value: float) -> None:
     settings = OptimizerSettings()
     setattr(settings, name, value)
     with pytest.raises(ValueError, match=name):

@@ -12,6 +12,7 @@ from torch import Tensor
 from tests.conftest import composed as compose
 from xrgs.capture.dataset import Dataset
 from xrgs.config import ComponentsConf
+from xrgs.errors import XrgsError
 from xrgs.splat.gaussians import Gaussians
 from xrgs.training.components import Components, Step
 from xrgs.training.components.natural_selection import NaturalSelection
@@ -99,6 +100,22 @@ def test_what_has_faded_is_removed_every_50_steps_down_to_the_budget(
     # Five have faded, and three of the six must go: the most transparent ones.
     six = with_opacities(gaussians, 0.0009, 0.9, 0.0005, 0.0006, 0.0007, 0.0008)
     assert indices(selection.to_prune(six, at(STOP + 100))) == [2, 3, 4]
+
+
+def test_faded_ones_may_be_removed_more_rarely(
+    build: Build, off: ComponentsConf, gaussians: Gaussians, at: Callable[[int], Step]
+) -> None:
+    off.natural_selection.budget, off.natural_selection.drop_every = 3.4 / (60 * 75), 500
+    (selection,) = build(off)
+    six = with_opacities(gaussians, 0.0009, 0.9, 0.0011, 0.5, 0.0008, 0.7)
+    assert selection.to_prune(six, at(STOP + 450)) is None
+    assert indices(selection.to_prune(six, at(STOP + 500))) == [0, 4]
+
+
+def test_a_period_of_no_steps_is_refused(build: Build, off: ComponentsConf) -> None:
+    off.natural_selection.budget, off.natural_selection.drop_every = 0.2, 0
+    with pytest.raises(XrgsError, match="drop_every=0: must be at least 1"):
+        build(off)
 
 
 @pytest.mark.parametrize("number", [UNTIL, UNTIL + 7])
