@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
     from omegaconf import DictConfig
 
+    from xrgs.splat.settings import OptimizerSettings
+
 #: The start of an interpolation, with the backslashes before it: an odd number of them escapes it.
 _INTERPOLATION = re.compile(r"(\\*)\$\{")
 #: Where msgspec found an error, at the end of its message: "... - at `$.train.steps`".
@@ -83,6 +85,7 @@ def to_conf(cfg: DictConfig) -> Conf:
 
     conf = from_dict({name: plain(name) for name in map(str, cfg) if name != "hydra"})
     _check_ranges(conf)
+    _check_optimizer(conf.splat.optimizer)
     _check_choices(conf)
     _check_strategy(conf)
     return conf
@@ -107,7 +110,16 @@ def _check_ranges(conf: Conf) -> None:
     for name in ("validation", "hr_share"):
         if not 0 <= (share := getattr(conf.train, name)) < 1:
             raise XrgsError(f"train.{name}={share}: must be from 0 to below 1")
-    optimizer = conf.splat.optimizer
+    if not (math.isfinite(scale := conf.splat.init_scale) and scale > 0):
+        raise XrgsError(f"splat.init_scale={scale}: must be finite and above 0")
+    for name in ("budget", "noise"):
+        value = getattr(conf.splat.densify, name)
+        if not (math.isfinite(value) and value >= 0):
+            raise XrgsError(f"splat.densify.{name}={value}: must be a finite number, 0 or more")
+
+
+def _check_optimizer(optimizer: OptimizerSettings) -> None:
+    """Raise `XrgsError` where a schedule of the learning rates is out of its range."""
     for name in ("means_decay_from", "length_decay_from"):
         if not 0 <= (begin := getattr(optimizer, name)) < NOMINAL_STEPS:
             raise XrgsError(
@@ -116,12 +128,6 @@ def _check_ranges(conf: Conf) -> None:
             )
     if not 0 <= (power := optimizer.length_power) <= 1:
         raise XrgsError(f"splat.optimizer.length_power={power}: must be from 0 to 1")
-    if not (math.isfinite(scale := conf.splat.init_scale) and scale > 0):
-        raise XrgsError(f"splat.init_scale={scale}: must be finite and above 0")
-    for name in ("budget", "noise"):
-        value = getattr(conf.splat.densify, name)
-        if not (math.isfinite(value) and value >= 0):
-            raise XrgsError(f"splat.densify.{name}={value}: must be a finite number, 0 or more")
 
 
 def _check_choices(conf: Conf) -> None:

@@ -30,17 +30,17 @@ class SplatOptimizer:
     where t0 is `means_decay_from * steps / 30,000`, 0 in gsplat. DashGaussian [chen2025dash] lets
     the decay wait while it trains at a reduced resolution.
 
-    gsplat's rates are meant for 30,000 steps. Adam moves a log scale by about its rate at each step,
-    so that 600 steps at 0.005 change a scale by at most a factor of e^3, and the first scales, the
-    spacing of the SfM points, are often ten times too large. With `length_power` of p, the rates of
-    scales, quats, sh0 and shN in a run of T steps, T below 30,000, are
+    gsplat's rates are meant for 30,000 steps. Adam moves a log scale by about its rate at each
+    step, so that 600 steps at 0.005 change a scale by at most a factor of e^3, and the first
+    scales, the spacing of the SfM points, are often ten times too large. With `length_power` of p,
+    the rates of scales, quats, sh0 and shN in a run of T steps, T below 30,000, are
 
         rate(t) = rate * (30,000 / T)^(p * min(1, (T - t) / (T - t1)))
 
     where t1 is `length_decay_from * T / 30,000`: larger up to t1, then falling exponentially to
-    gsplat's own after the last step, so that the noise of large steps settles. In a run of 30,000
-    steps and more the factor is one. Our choice: the distance that noise carries a parameter grows
-    with rate^2 * steps, which p = 0.5 keeps, and reports/rates compares the powers.
+    gsplat's own after the last step, so that the noise of large steps settles. From 30,000 steps
+    on the factor is one. Our choice: a random walk of T steps gets as far as rate * sqrt(T), which
+    p = 0.5 keeps. reports/rates compares powers.
 
     With `shN_every` of k, the harmonics above band 0 move at every k-th step alone, the first one
     included, by the gradient of that step, and at k times their rate. Their moments are updated at
