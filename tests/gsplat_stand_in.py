@@ -60,9 +60,7 @@ def rasterization(**given: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
 
 
 @contextmanager
-def stand_in(
-    device: str = "cpu", function: Callable[..., Any] = rasterization
-) -> Iterator[None]:
+def stand_in(device: str = "cpu", function: Callable[..., Any] = rasterization) -> Iterator[None]:
     """Let `splat.backend=gsplat` call `function`, with tensors on `device`."""
     module = "xrgs.splat.gsplat.rasterizer"
     backend._module.cache_clear()

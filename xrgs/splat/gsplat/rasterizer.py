@@ -90,7 +90,8 @@ def render(
         XrgsError: A setting differs from the constants of gsplat's kernels.
     """
     check_raster("gsplat", settings)
-    if means2d_offset is not None and not is_zero_offset(means2d_offset):
+    given = means2d_offset is not None and len(means2d_offset) > 0
+    if given and not is_zero_offset(means2d_offset):
         raise ValueError("means2d_offset must be of zero_means2d_offset: gsplat adds no offset")
     if raw:
         scales, opacities = activate(gaussians.scales, gaussians.opacities)
