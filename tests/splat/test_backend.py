@@ -136,7 +136,9 @@ def test_other_versions_of_gsplat_are_refused(
     gsplat_version: Callable[[str | None], None], version: str
 ) -> None:
     gsplat_version(version)
-    with pytest.raises(XrgsError, match=rf"gsplat {version} is installed, and xrgs knows 1\.5\.3 and"):
+    with pytest.raises(
+        XrgsError, match=rf"gsplat {version} is installed, and xrgs knows 1\.5\.3 and"
+    ):
         resolve_backend("gsplat")
 
 
