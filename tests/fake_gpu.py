@@ -96,7 +96,7 @@ class _Operations(TorchDispatchMode):
 
 
 class _Functions(TorchFunctionMode):
-    """Does what torch does in C++ for its own devices alone."""
+    """Does what torch does in C++ for its own devices only."""
 
     def __torch_function__(
         self, function: Callable[..., Any], _types: object, args: Any = (), kwargs: Any = None

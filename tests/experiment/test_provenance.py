@@ -85,7 +85,7 @@ def test_without_git_there_is_no_commit(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def test_backends_and_gpus_are_other_machines(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Times are compared between cells of one machine alone."""
+    """Times are compared between cells of one machine only."""
     monkeypatch.setattr(backend, "_gsplat_version", lambda: ("1.6.0", 0.99))
     monkeypatch.setattr(provenance, "device", backend.DEVICES.get)
     names = []

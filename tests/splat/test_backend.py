@@ -8,7 +8,7 @@ import inspect
 import logging
 from collections.abc import Callable, Iterator
 from functools import partial
-from importlib.metadata import PackageNotFoundError
+from importlib import metadata
 from pathlib import Path
 from types import ModuleType
 from typing import get_args
@@ -99,11 +99,11 @@ def gsplat_version(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str | 
         def installed(name: str) -> str:
             assert name == "gsplat"
             if version is None:
-                raise PackageNotFoundError
+                raise metadata.PackageNotFoundError
             return version
 
         backend._gsplat_version.cache_clear()
-        monkeypatch.setattr(backend.metadata, "version", installed)
+        monkeypatch.setattr(metadata, "version", installed)
 
     yield pretend
     backend._gsplat_version.cache_clear()

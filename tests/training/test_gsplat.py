@@ -53,7 +53,7 @@ def config(ablation: str, *changes: str, backend: str = "gsplat") -> Conf:
 
 @pytest.mark.parametrize("ablation", ["baseline", "xrgs", "plus"])
 def test_fifty_steps_are_those_of_the_native_backend(data: Dataset, ablation: str) -> None:
-    # The first Gaussians are round, and the gradients of their rotations rounding alone. With
+    # The first Gaussians are round, and the gradients of their rotations are rounding only. With
     # gsplat's eps of 1e-15, Adam would make whole steps of it.
     changes = ("train.steps=50", "splat.densify.every=5000", "splat.optimizer.eps=1e-5")
     native = train(data, config(ablation, *changes, backend="native"))

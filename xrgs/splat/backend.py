@@ -30,7 +30,7 @@ _GSPLAT_ALPHA_MAX = {"1.5.3": 0.999, "1.6": 0.99}
 Operation = Literal["activations", "densify", "loss", "optimizer", "rasterizer", "resample"]
 """The name of a module that both `xrgs/splat/torch/` and `xrgs/splat/native/` have.
 
-`xrgs/splat/gsplat/` has the rasterizer alone."""
+`xrgs/splat/gsplat/` has the rasterizer only."""
 
 
 def resolve_backend(name: str) -> str:
