@@ -42,11 +42,11 @@ def main() -> None:
     parser.add_argument("overrides", nargs="*", help="further settings, as train.steps=300")
     options = parser.parse_intermixed_args()
     backends = options.backends or ("gsplat" if options.paper else "native,gsplat")
-    preset, recipes = ("paper", "baseline") if options.paper else ("laptop", "baseline,plus")
+    preset, recipes = ("paper", []) if options.paper else ("laptop", ["+ablation=plus"])
     settings = [ALPHA_MAX] if importlib.metadata.version("gsplat").startswith("1.5") else []
     settings += [f"preset={preset}", f"data_root={options.llff}", f"store={options.store}"]
     for backend in backends.split(","):
-        arms = [f"splat.backend={backend}", f"+ablation={recipes}", "baseline=false"]
+        arms = [*recipes, f"splat.backend={backend}"]  # and the baseline
         command = ["xrgs-sweep", "scene=llff/fern", *arms, *settings, *options.overrides]
         subprocess.run(command, check=True)  # noqa: S603
     cells = read(options.store)

@@ -21,13 +21,13 @@ DEVICE = torch.device("lazy", 0)
 
 
 class _OnGpu(torch.Tensor):
-    """A tensor that says it is on `DEVICE`; `inner` has the values."""
+    """A tensor that says it is on `DEVICE`; `of_processor` has its values."""
 
-    inner: torch.Tensor
+    of_processor: torch.Tensor
 
     @staticmethod
     def __new__(cls, inner: torch.Tensor) -> _OnGpu:
-        made: _OnGpu = torch.Tensor._make_wrapper_subclass(  # type: ignore[attr-defined]
+        made: _OnGpu = torch.Tensor._make_wrapper_subclass(
             cls,
             inner.shape,
             strides=inner.stride(),
@@ -35,17 +35,17 @@ class _OnGpu(torch.Tensor):
             dtype=inner.dtype,
             device=DEVICE,
         )
-        made.inner = inner
+        made.of_processor = inner
         return made
 
     def data_ptr(self) -> int:
-        return self.inner.data_ptr()
+        return self.of_processor.data_ptr()
 
     def untyped_storage(self) -> torch.UntypedStorage:
-        return self.inner.untyped_storage()
+        return self.of_processor.untyped_storage()
 
     @classmethod
-    def __torch_dispatch__(
+    def __torch_dispatch__(  # type: ignore[override]
         cls, operation: Any, _types: object, args: Any = (), kwargs: Any = None
     ) -> Any:
         return _run(operation, args, kwargs or {})
@@ -70,7 +70,7 @@ def _run(operation: Any, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
     inner_args, inner_kwargs = tree_map(_inner, (tuple(args), kwargs))
     with _disable_current_modes():
         made = operation(*inner_args, **inner_kwargs)
-    known = {id(tensor.inner): tensor for tensor in ours}
+    known = {id(tensor.of_processor): tensor for tensor in ours}
 
     def outer(value: Any) -> Any:
         if not isinstance(value, torch.Tensor):
@@ -83,10 +83,10 @@ def _run(operation: Any, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
 
 
 def _inner(value: Any) -> Any:
-    return value.inner if isinstance(value, _OnGpu) else value
+    return value.of_processor if isinstance(value, _OnGpu) else value
 
 
-class _Operations(TorchDispatchMode):
+class _Operations(TorchDispatchMode):  # type: ignore[no-untyped-call]
     """Sees operations without a tensor on the device, as `torch.zeros(3, device=DEVICE)`."""
 
     def __torch_dispatch__(
@@ -116,5 +116,5 @@ class _Functions(TorchFunctionMode):
 @contextmanager
 def fake_gpu() -> Iterator[None]:
     """Let torch compute on `DEVICE`."""
-    with _Operations(), _Functions():
+    with _Operations(), _Functions():  # type: ignore[no-untyped-call]
         yield

@@ -22,6 +22,7 @@ from xrgs.capture.dataset import Dataset
 from xrgs.config import Conf
 from xrgs.evaluation import protocol
 from xrgs.splat.gaussians import PARAMETERS
+from xrgs.splat.loss import photometric_loss
 from xrgs.training import loop
 from xrgs.training.checkpoint import Checkpoint
 from xrgs.training.loop import train
@@ -102,13 +103,12 @@ def test_a_killed_run_continues(
     data: Dataset, ablation: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     conf, calls = config(ablation, "train.steps=12", "splat.densify.every=7500"), [0]
-    real = loop.photometric_loss
 
     def mortal(*arguments: Any, **named: Any) -> Any:
         calls[0] += 1
         if calls[0] == 18:
             raise Kill
-        return real(*arguments, **named)
+        return photometric_loss(*arguments, **named)
 
     def checkpoint() -> Checkpoint:
         return Checkpoint(tmp_path / "checkpoint.npz", "cell", every_s=1e-9)

@@ -134,7 +134,7 @@ def wait_for_gpu() -> None:
     """Wait until a GPU has done what this process has asked of it, if it has; for clocks."""
     import torch
 
-    if torch.cuda.is_initialized():
+    if torch.cuda.is_initialized():  # type: ignore[no-untyped-call]
         torch.cuda.synchronize()
 
 

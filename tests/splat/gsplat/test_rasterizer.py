@@ -48,7 +48,7 @@ def differentiated(of_backend: str, scene: Scene = SCENE, **options: Any) -> tup
     """A render, and the gradients of a loss of it by each parameter and the offset."""
     leaves = with_gradients(scene)
     offset = zero_means2d_offset(len(leaves["means"]))
-    arguments = {"camera": CAMERA, "raster": SETTINGS} | options
+    arguments: dict[str, Any] = {"camera": CAMERA, "raster": SETTINGS} | options
     render = draw(leaves, **arguments, means2d_offset=offset, backend=of_backend)
     weights = torch.rand(*render.image.shape[:2], 4, generator=torch.Generator().manual_seed(1))
     loss = (render.image * (weights[..., :3] - 0.3)).sum() + (render.alpha * weights[..., 3]).sum()
@@ -148,7 +148,7 @@ def test_means2d_in_the_graph_give_the_offset_its_gradient_and_are_freed(
         if version == "1.6" and given["absgrad"]:
             holder = torch.zeros_like(means2d)
             means2d.register_hook(partial(fill, holder))
-            means2d.absgrad = holder  # type: ignore[attr-defined]
+            means2d.absgrad = holder
             sums = means2d.square().sum(dim=(0, 2))
         else:
             sums = AbsgradOf153.apply(means2d)  # type: ignore[no-untyped-call]
@@ -185,7 +185,8 @@ def test_an_offset_that_gsplat_would_not_add_is_refused() -> None:
     ],
 )
 def test_constants_of_gsplats_kernels_are_named(name: str, value: float, constant: str) -> None:
-    settings = replace(SETTINGS, **{name: value})
+    changed: dict[str, Any] = {name: value}
+    settings = replace(SETTINGS, **changed)
     with pytest.raises(
         XrgsError, match=rf"splat\.raster\.{name}={value}: .* gsplat 1\.5\.3 have {constant}"
     ):
