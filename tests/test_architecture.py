@@ -46,7 +46,7 @@ ONLY_IN = {
     "matplotlib": ("report", "bench"),
     "pandas": ("experiment", "report", "bench"),
     "kornia": ("evaluation/metrics/ssim",),
-    "gsplat": (),
+    "gsplat": ("splat/gsplat/rasterizer",),
     "tqdm": ("runtime/progress", "sweep/monitor"),
     "av": ("capture/scenes/video", "viewer/film"),
     "imagecodecs": ("capture/colour", "capture/deep"),

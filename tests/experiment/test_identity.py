@@ -24,6 +24,7 @@ from xrgs.errors import XrgsError
 from xrgs.evaluation import metrics, scoring
 from xrgs.experiment import identity
 from xrgs.safeio import code, refactorings
+from xrgs.splat import backend
 from xrgs.splat.backend import resolve_backend
 from xrgs.training.registry import BUILT_IN, modules_of
 
@@ -239,10 +240,33 @@ def test_the_kernels_count_where_they_train(package: Path, confs: dict[str, Conf
     assert ids_after(edit, confs) == (confs.keys() - native, native)
 
 
+def test_the_renderer_of_gsplat_and_its_version_count_where_it_renders(
+    package: Path, confs: dict[str, Conf], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    alpha_max = {"1.5.3": 0.999, "1.6.0": 0.99}
+    version = ["1.5.3"]
+    monkeypatch.setattr(backend, "_gsplat_version", lambda: (version[0], alpha_max[version[0]]))
+    on_gsplat = copy.deepcopy(confs["baseline torch"])
+    on_gsplat.splat.backend = "gsplat"
+    with pytest.raises(XrgsError, match=r"splat\.raster\.alpha_max=0\.99: .*gsplat 1\.5\.3"):
+        cell_id(on_gsplat)
+    version[0] = "1.6.0"
+    on_160 = cell_id(on_gsplat)
+    on_gsplat.splat.raster.alpha_max, version[0] = 0.999, "1.5.3"
+    known = {"gsplat": on_gsplat, **confs}
+    assert len({on_160, *map(cell_id, known.values())}) == 2 + len(confs)
+    file = package / "splat" / "gsplat" / "rasterizer.py"
+    edit = edited(file, "packed=False", "packed=True")
+    assert ids_after(edit, known) == (set(confs), {"gsplat"})
+
+
 def test_every_file_of_the_model_and_of_training_is_hashed_or_changes_no_number() -> None:
     hashed = {
         file.relative_to(PACKAGE).as_posix()
-        for file in code.sources(*identity.CORE, *(m for key in BUILT_IN for m in modules_of(key)))
+        for file in code.sources(
+            *(*identity.CORE, *identity.BACKEND_CODE["gsplat"]),
+            *(m for key in BUILT_IN for m in modules_of(key)),
+        )
     }
     files = {
         file.relative_to(PACKAGE).as_posix()

@@ -5,11 +5,14 @@ from __future__ import annotations
 import subprocess
 from pathlib import Path
 
+import msgspec
 import pytest
+import torch
 
 import xrgs
 from xrgs.experiment import provenance
 from xrgs.experiment.schema import Provenance
+from xrgs.splat import backend
 
 FILES = ("xrgs/__init__.py", "conf/ablation/plus.yaml", "sweeps/all.yaml", "README.md")
 
@@ -79,3 +82,23 @@ def test_a_checkout_is_asked_and_not_the_file_of_a_build_that_was_killed(checkou
 def test_without_git_there_is_no_commit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(xrgs, "__file__", str(tmp_path / "xrgs/__init__.py"))
     assert (made_with().git, made_with().git_diff_sha256) == (None, None)
+
+
+def test_backends_and_gpus_are_other_machines(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Times are compared between cells of one machine only."""
+    monkeypatch.setattr(backend, "_gsplat_version", lambda: ("1.6.0", 0.99))
+    monkeypatch.setattr(provenance, "device", backend.DEVICES.get)
+    names = []
+    for gpu in ("NVIDIA H200", "NVIDIA A100"):
+        monkeypatch.setattr(torch.cuda, "get_device_name", lambda gpu=gpu: gpu)
+        made = provenance.collect(2, "gsplat")
+        assert (made.gpu, made.backend, made.arithmetic) == (gpu, "gsplat", "gsplat 1.6.0")
+        names.append(provenance.machine(made))
+    made = provenance.collect(2, "torch")
+    assert made.gpu is None
+    names += [provenance.machine(made)]
+    assert len(set(names)) == 3
+    assert names[0].endswith(", NVIDIA H200, threads 2, gsplat")
+    # Cells of earlier versions have no such entry.
+    before = {k: v for k, v in msgspec.to_builtins(made).items() if k != "gpu"}
+    assert msgspec.convert(before, Provenance) == made

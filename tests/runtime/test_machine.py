@@ -15,6 +15,7 @@ import torch
 
 from xrgs.runtime import machine
 from xrgs.runtime.machine import (
+    gpus,
     peak_rss,
     set_passive_openmp_wait,
     set_portable_blas,
@@ -219,3 +220,50 @@ def test_the_peak_memory_is_in_bytes(
     monkeypatch.setattr(sys, "platform", platform)
     monkeypatch.setattr(resource, "getrusage", lambda *_: Usage)
     assert peak_rss() == 300_000 * unit
+
+
+@pytest.mark.parametrize(
+    ("visible", "names"),
+    [
+        ("0", ["0"]),
+        ("2, 0", ["2", "0"]),
+        ("GPU-1f,MIG-2e", ["GPU-1f", "MIG-2e"]),
+        ("", []),
+        ("-1", []),
+        ("NoDevFiles", []),  # as SLURM has it for a job that asked for none
+    ],
+)
+def test_the_gpus_are_those_that_are_visible(
+    monkeypatch: pytest.MonkeyPatch, visible: str, names: list[str]
+) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
+    assert gpus() == names
+
+
+@pytest.mark.parametrize(
+    ("script", "names"),
+    [
+        ("echo GPU-1f; echo GPU-2e", ["GPU-1f", "GPU-2e"]),
+        ("echo 'NVIDIA-SMI has failed because it has no driver'; exit 9", []),
+        (None, []),
+    ],
+)
+def test_the_gpus_are_those_that_nvidia_smi_lists(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, script: str | None, names: list[str]
+) -> None:
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    if script is not None:
+        (tmp_path / "nvidia-smi").write_text(f"#!/bin/sh\n{script}\n")
+        (tmp_path / "nvidia-smi").chmod(0o755)
+    assert gpus() == names
+
+
+def test_clocks_wait_for_a_gpu_that_is_in_use(monkeypatch: pytest.MonkeyPatch) -> None:
+    waits: list[bool] = []
+    monkeypatch.setattr(torch.cuda, "synchronize", lambda: waits.append(True))
+    machine.wait_for_gpu()
+    assert not waits
+    monkeypatch.setattr(torch.cuda, "is_initialized", lambda: True)
+    machine.wait_for_gpu()
+    assert waits == [True]

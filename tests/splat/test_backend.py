@@ -1,4 +1,4 @@
-"""The choice of a backend, and that both backends have the same functions."""
+"""The choice of a backend, and that the backends have the same functions."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import importlib.util
 import inspect
 import logging
 from collections.abc import Callable, Iterator
+from functools import partial
+from importlib import metadata
 from pathlib import Path
 from types import ModuleType
 from typing import get_args
@@ -22,6 +24,7 @@ from xrgs.splat.backend import (
     implementation,
     resolve_backend,
 )
+from xrgs.splat.settings import RasterSettings
 
 Pretend = Callable[[bool], None]
 OPERATIONS: tuple[Operation, ...] = get_args(Operation)
@@ -48,6 +51,8 @@ def built(monkeypatch: pytest.MonkeyPatch) -> Iterator[Pretend]:
         ("native", True, "native"),
         ("torch", True, "torch"),
         ("torch", False, "torch"),
+        ("gsplat", True, "gsplat"),
+        ("gsplat", False, "gsplat"),
     ],
 )
 def test_choice(
@@ -84,6 +89,73 @@ def test_native_required_and_missing(built: Pretend, monkeypatch: pytest.MonkeyP
 def test_unknown_name() -> None:
     with pytest.raises(ValueError, match="'cuda'"):
         resolve_backend("cuda")
+
+
+@pytest.fixture
+def gsplat_version(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str | None], None]]:
+    """Pretends that a version of gsplat is installed, or none."""
+
+    def pretend(version: str | None) -> None:
+        def installed(name: str) -> str:
+            assert name == "gsplat"
+            if version is None:
+                raise metadata.PackageNotFoundError
+            return version
+
+        backend._gsplat_version.cache_clear()
+        monkeypatch.setattr(metadata, "version", installed)
+
+    yield pretend
+    backend._gsplat_version.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("version", "name", "alpha_max"),
+    [
+        ("1.5.3", "1.5.3", 0.999),
+        ("1.5.3+pt24cu124", "1.5.3", 0.999),
+        ("1.6.0", "1.6.0", 0.99),
+        ("1.6", "1.6", 0.99),
+    ],
+)
+def test_known_versions_of_gsplat(
+    gsplat_version: Callable[[str | None], None], version: str, name: str, alpha_max: float
+) -> None:
+    gsplat_version(version)
+    assert resolve_backend("gsplat") == "gsplat"
+    assert backend.arithmetic("gsplat") == f"gsplat {name}"
+    backend.check_raster("gsplat", RasterSettings(alpha_max=alpha_max))
+    other = 0.99 if alpha_max == 0.999 else 0.999
+    with pytest.raises(XrgsError, match=rf"alpha_max={other}: .*gsplat {name} have {alpha_max};"):
+        backend.check_raster("gsplat", RasterSettings(alpha_max=other))
+    backend.check_raster("native", RasterSettings(alpha_max=other))
+
+
+@pytest.mark.parametrize("version", ["1.5.2", "1.4.0", "1.7.0", "1.60", "2.0"])
+def test_other_versions_of_gsplat_are_refused(
+    gsplat_version: Callable[[str | None], None], version: str
+) -> None:
+    gsplat_version(version)
+    with pytest.raises(
+        XrgsError, match=rf"gsplat {version} is installed, and xrgs knows 1\.5\.3 and"
+    ):
+        resolve_backend("gsplat")
+
+
+def test_gsplat_asked_for_and_missing(gsplat_version: Callable[[str | None], None]) -> None:
+    gsplat_version(None)
+    for use in (resolve_backend, backend.arithmetic, partial(implementation, "loss")):
+        with pytest.raises(XrgsError, match=r"not installed: pip install 'xrgs\[gsplat\]'"):
+            use("gsplat")
+
+
+def test_all_but_the_renderer_of_gsplat_is_torchs(
+    gsplat_version: Callable[[str | None], None],
+) -> None:
+    gsplat_version("1.6.0")
+    for operation in set(OPERATIONS) - {"rasterizer"}:
+        assert implementation(operation, "gsplat") is implementation(operation, "torch")
+    assert backend.device("native") == backend.device("torch") == "cpu"
 
 
 def functions_of(module: ModuleType) -> dict[str, inspect.Signature]:

@@ -18,6 +18,7 @@ from xrgs.config import Conf
 from xrgs.errors import StoreError
 from xrgs.experiment import provenance
 from xrgs.safeio.atomic import write_json
+from xrgs.splat import backend
 from xrgs.sweep import estimate
 from xrgs.sweep.estimate import TORCH_SLOWDOWN, Cost, CostEstimator
 
@@ -110,6 +111,18 @@ def test_steps_threads_and_backend_scale_the_time(past: Past) -> None:
     assert past.cost(threads=4).seconds == pytest.approx(25)
     native = replace(past.conf, splat=replace(past.conf.splat, backend="native"))
     assert past.cost(native).seconds == pytest.approx(100 / TORCH_SLOWDOWN)
+
+
+def test_times_of_a_gpu_and_of_a_processor_say_nothing_about_each_other(
+    past: Past, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(backend, "_gsplat_version", lambda: ("1.6.0", 0.99))
+    on_gpu = replace(past.conf, splat=replace(past.conf.splat, backend="gsplat"))
+    past.add(100.0)
+    assert CostEstimator(past.store).cost(on_gpu, "v", 1) is None
+    past.add(7.0, on_gpu, backend="gsplat")
+    assert past.cost(on_gpu, threads=4).seconds == pytest.approx(7)  # the GPU's, whatever threads
+    assert past.cost().seconds == pytest.approx(100)
 
 
 def test_pixels_and_gaussians_scale_the_time_and_the_memory(past: Past) -> None:

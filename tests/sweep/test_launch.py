@@ -27,7 +27,7 @@ from xrgs.runtime import lease
 from xrgs.sweep import launch
 from xrgs.sweep.axes import CellSpec
 from xrgs.sweep.jobs.job import INTERRUPTED, UNKNOWN
-from xrgs.sweep.launch import LOST, Launches, capacity
+from xrgs.sweep.launch import LOST, Launches, capacity, one_cell_a_gpu
 from xrgs.sweep.plan import PlannedCell
 from xrgs.sweep.session import SweepSession
 
@@ -82,6 +82,61 @@ def test_a_ray_cluster_that_runs_already_is_given_no_size(monkeypatch: pytest.Mo
     assert settings("auto") == joined
     monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:6379")
     assert settings(None) == joined
+
+
+@pytest.mark.parametrize(
+    ("arguments", "gpus", "at_once", "cores", "settings"),
+    [
+        (["hydra/launcher=basic"], 4, 1, 8, {}),
+        (["hydra/launcher=joblib"], 4, 4, 2, {"n_jobs": 4, "batch_size": 1}),
+        (["hydra/launcher=joblib"], 1, 1, 8, {"n_jobs": 1, "batch_size": 1}),
+        (
+            ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"],
+            *(4, 2, 4, {"n_jobs": 2, "batch_size": 1}),
+        ),
+        (["hydra/launcher=submitit_local"], 2, 2, 4, {}),
+        (["hydra/launcher=submitit_slurm"], 0, None, 1, {"cpus_per_task": 1, "gres": "gpu:1"}),
+        (
+            ["hydra/launcher=submitit_slurm", "hydra.launcher.gres='gpu:a100:1'"],
+            *(0, None, 1, {"cpus_per_task": 1}),
+        ),
+        (
+            ["hydra/launcher=submitit_slurm", "hydra.launcher.gpus_per_node=1"],
+            *(0, None, 1, {"cpus_per_task": 1}),
+        ),
+    ],
+)
+def test_each_cell_of_gsplat_has_a_gpu(
+    composed: Callable[..., DictConfig],
+    arguments: list[str],
+    gpus: int,
+    at_once: int | None,
+    cores: int,
+    settings: Mapping[str, Any],
+) -> None:
+    launcher = composed(*arguments).hydra.launcher
+    allowed = one_cell_a_gpu(launcher, capacity(launcher, 0, machine=8), gpus)
+    assert allowed.at_once == at_once
+    assert allowed.settings == settings
+    assert allowed.threads(1000, machine=8) == cores
+    assert allowed.batch in {None, at_once}
+
+
+@pytest.mark.parametrize(("remote", "asked"), [({}, 1), ({"num_gpus": 2}, 2)])
+def test_ray_is_asked_for_a_gpu(remote: Mapping[str, int], asked: int) -> None:
+    ray = {"init": {"address": "auto"}, "remote": remote}
+    launcher = OmegaConf.create({"_target_": "hydra_plugins.x.RayLauncher", "ray": ray})
+    allowed = one_cell_a_gpu(launcher, capacity(launcher, 2, machine=8), 0)
+    assert allowed.settings["ray.remote.num_gpus"] == asked
+
+
+@pytest.mark.parametrize("launcher", ["basic", "joblib", "submitit_local"])
+def test_a_machine_without_gpus_launches_no_cell_of_gsplat(
+    composed: Callable[..., DictConfig], launcher: str
+) -> None:
+    chosen = composed(f"hydra/launcher={launcher}").hydra.launcher
+    with pytest.raises(XrgsError, match=r"splat\.backend=gsplat: this machine has no GPU"):
+        one_cell_a_gpu(chosen, capacity(chosen, 0, machine=8), 0)
 
 
 def test_no_jobs_at_all_are_refused(composed: Callable[..., DictConfig]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -41,6 +41,11 @@ class LoadedView:
     """[H, W] bool, True for a pixel that is used; None uses all."""
     need: float = 1.0
     """How many times as many px a side the view needs, see `xrgs.capture.views.View`."""
+
+    def to(self, device: str) -> LoadedView:
+        """Return the view with its photograph and mask on a device; its camera stays."""
+        mask = None if self.mask is None else self.mask.to(device)
+        return replace(self, pixels=self.pixels.to(device), mask=mask)
 
     @property
     def image(self) -> torch.Tensor:

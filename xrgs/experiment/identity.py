@@ -15,7 +15,7 @@ Paths, thread counts, logging and labels are not part of it, so that a finished 
 under another label, in another folder or on another machine. Of a machine the identity has the
 arithmetic (`xrgs.splat.backend.arithmetic`): the native backend gives the same bits on all machines
 of the same arithmetic. The last digits of the torch backend differ among machines, and this is not
-part of it.
+part of it. Of the gsplat backend it has the version of gsplat.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from xrgs.experiment.schema import Identity
 from xrgs.safeio.code import code_digest
 from xrgs.safeio.hashing import digest
 from xrgs.safeio.refactorings import canonical
-from xrgs.splat.backend import arithmetic, resolve_backend
+from xrgs.splat.backend import arithmetic, check_raster, resolve_backend
 from xrgs.training import plugins
 from xrgs.training.registry import modules_of, order_of
 
@@ -77,9 +77,9 @@ CORE = (
     "training/seeding.py",
     "training/work.py",
 )
-#: The C++ sources of the native backend. The compiled module is not hashed: two builds of the same
-#: sources differ in their bytes and give the same numbers.
-NATIVE = ("csrc",)
+#: Files that count on one backend only. Of the native one these are the C++ sources, and not the
+#: compiled module: two builds of the same sources differ in their bytes and give the same numbers.
+BACKEND_CODE = {"native": ("csrc",), "gsplat": ("splat/gsplat",)}
 
 
 def cell_identity(conf: Conf, variant_id: str) -> Identity:
@@ -90,9 +90,11 @@ def cell_identity(conf: Conf, variant_id: str) -> Identity:
         variant_id: The id of the frozen variant that the cell trains on.
 
     Raises:
-        XrgsError: The configured backend is not available on this machine, or a plugin is missing.
+        XrgsError: The configured backend is not available on this machine, or can't render with
+            these settings, or a plugin is missing.
     """
     backend = resolve_backend(conf.splat.backend)
+    check_raster(backend, conf.splat.raster)
     components = identity_values(conf.components)
     return Identity(
         variant=variant_id,
@@ -117,7 +119,7 @@ def training_code(
     """Return the digest of each part of the code that trains a cell; files are read once.
 
     Args:
-        backend: `native` or `torch`.
+        backend: `native`, `torch` or `gsplat`.
         components: Keys of the components that are on.
         plugin_names: Names of components of other packages, sorted.
 
@@ -141,8 +143,8 @@ def code_now(
 def _files(backend: str, components: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
     """Return the source files of each part of the code, relative to the package."""
     files: dict[str, tuple[str, ...]] = {"core": CORE}
-    if backend == "native":
-        files["native"] = NATIVE
+    if backend in BACKEND_CODE:
+        files[backend] = BACKEND_CODE[backend]
     return files | {key: modules_of(key) for key in components if modules_of(key)}
 
 

@@ -16,14 +16,14 @@ from xrgs.experiment import commit
 from xrgs.experiment.schema import Provenance
 from xrgs.runtime.machine import usable_cores
 from xrgs.safeio.records import read_struct
-from xrgs.splat.backend import arithmetic
+from xrgs.splat.backend import arithmetic, device
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
 _PACKAGES = ("torch", "numpy", "pycolmap", "kornia", "scikit-image", "hydra-core", "pandas")
 #: The fields that a cell's times depend on, beside the program.
-MACHINE_KEYS = ("cpu", "instruction_set", "threads", "backend")
+MACHINE_KEYS = ("cpu", "gpu", "instruction_set", "threads", "backend")
 
 
 def _commit() -> Mapping[str, str | None]:
@@ -45,7 +45,7 @@ def _cpu() -> str:
 
 
 def _instruction_set(backend: str) -> str | None:
-    """Return the instruction set of the native kernels; None for torch, which chooses its own."""
+    """Return the instruction set of the native kernels; None for others, which choose their own."""
     if backend != "native":
         return None
     from xrgs import _native
@@ -53,12 +53,21 @@ def _instruction_set(backend: str) -> str | None:
     return str(_native.isa())
 
 
+def _gpu(backend: str) -> str | None:
+    """Return the name of the GPU that trains; None where the backend uses none."""
+    if device(backend) != "cuda":
+        return None
+    import torch
+
+    return torch.cuda.get_device_name()
+
+
 def collect(threads: int, backend: str) -> Provenance:
     """Return the program, its libraries, the machine and the time.
 
     Args:
         threads: The threads that the cell uses.
-        backend: The rasterizer in use, `native` or `torch`.
+        backend: The rasterizer in use: `native`, `torch` or `gsplat`.
 
     Raises:
         WeightsError: The weights of LPIPS on this machine are not the published ones. A cell that
@@ -81,13 +90,14 @@ def collect(threads: int, backend: str) -> Provenance:
         lpips_weights_sha256=None if published is None else weights.CONTENT_SHA256,
         started=datetime.now(UTC).isoformat(timespec="seconds"),
         cpu=_cpu(),
+        gpu=_gpu(backend),
         instruction_set=_instruction_set(backend),
     )
 
 
 def machine(made: Provenance) -> str:
     """Return what a cell's times depend on, for example `AMD EPYC, avx2, threads 1, native`."""
-    parts = (made.cpu, made.instruction_set, f"threads {made.threads}", made.backend)
+    parts = (made.cpu, made.gpu, made.instruction_set, f"threads {made.threads}", made.backend)
     return ", ".join(filter(None, parts))
 
 
@@ -104,7 +114,7 @@ def this_processor(backend: str) -> str:
     """Return `processor` of a cell that this machine trains.
 
     Args:
-        backend: The rasterizer in use, `native` or `torch`.
+        backend: The rasterizer in use: `native`, `torch` or `gsplat`.
     """
     return _processor(_cpu(), _instruction_set(backend))
 

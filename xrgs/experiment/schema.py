@@ -104,6 +104,8 @@ class Provenance(Struct, frozen=True):
     arithmetic: str = "not recorded"
     lpips_weights_sha256: str | None = None
     cpu: str | None = None
+    gpu: str | None = None
+    """The GPU that trained the cell; None where the processor did."""
     instruction_set: str | None = None
     machines_in_turn: str = ""
     """The machines that trained the cell one after another, where they were several."""

@@ -162,6 +162,7 @@ def _machine(made: Sequence[Provenance]) -> tuple[str, ...]:
     threads = _distinct(one.threads for one in made)
     phrases = (
         _distinct(one.cpu for one in made),
+        _distinct(one.gpu for one in made),
         f"{threads} thread{'s' * (threads != '1')}",
         _distinct(f"{one.backend} backend" for one in made),
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import resource
+import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -127,6 +128,28 @@ def set_torch_threads(threads: int) -> int:
 
     torch.set_num_threads(threads or usable_cores())
     return torch.get_num_threads()
+
+
+def wait_for_gpu() -> None:
+    """Wait until a GPU has done what this process has asked of it, if it has; for clocks."""
+    import torch
+
+    if torch.cuda.is_initialized():  # type: ignore[no-untyped-call]
+        torch.cuda.synchronize()
+
+
+def gpus() -> list[str]:
+    """Return the GPUs of NVIDIA that this process may use, as CUDA_VISIBLE_DEVICES names them."""
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if visible is not None:
+        names = [name.strip() for name in visible.split(",")]
+        return [name for name in names if name not in {"", "-1", "NoDevFiles"}]
+    command = ["nvidia-smi", "--query-gpu=uuid", "--format=csv,noheader"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=True)  # noqa: S603
+    except (OSError, subprocess.CalledProcessError):  # not installed, or without a driver
+        return []
+    return done.stdout.split()
 
 
 @contextmanager

@@ -104,6 +104,13 @@ class Gaussians:
             points, colors, init_opacity=init_opacity, sh_degree=sh_degree, generator=generator
         )
 
+    def to(self, device: str) -> Gaussians:
+        """Return the Gaussians on a device, as new leaf tensors unless they are there already."""
+        if self.means.device.type == device:
+            return self
+        moved = {name: self[name].detach().to(device) for name in PARAMETERS}
+        return Gaussians(**{name: value.requires_grad_() for name, value in moved.items()})
+
     def raw(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Return the parameters in the order of `PARAMETERS`, with shN detached.
 

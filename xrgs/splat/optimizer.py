@@ -58,7 +58,7 @@ class SplatOptimizer:
     Attributes:
         adam: Adam's state of each parameter by the names of torch: `step` [], `exp_avg` and
             `exp_avg_sq` [N, ...]; empty before the parameter's first step.
-        backend: `torch` or `native`: the backend that computes a step.
+        backend: `torch`, `native` or `gsplat`: the backend that computes a step.
         gaussians: The optimized Gaussians.
         rates: The present learning rate of each parameter.
         settings: Learning rates at the start, and Adam's constants.
@@ -82,7 +82,8 @@ class SplatOptimizer:
             settings: Learning rates and Adam's constants.
             scene_scale: Extent of the scene in world units, above 0.
             steps: Number of steps of the whole run, at least 1.
-            backend: `torch`, `native` or `auto` (`resolve_backend`), which computes the steps.
+            backend: `torch`, `native`, `gsplat` or `auto` (`resolve_backend`), which computes the
+                steps.
 
         Raises:
             ValueError: `scene_scale` or `steps` is not above 0, or a setting is out of its range.
@@ -139,7 +140,7 @@ class SplatOptimizer:
         """Return exp_avg, exp_avg_sq and step of a parameter, zeros before its first step."""
         state = self.adam[name]
         if not state:
-            state["step"] = torch.zeros(())
+            state["step"] = torch.zeros((), device=self.gaussians[name].device)
             for key in _MOMENTS:
                 state[key] = torch.zeros_like(self.gaussians[name], requires_grad=False)
         return state["exp_avg"], state["exp_avg_sq"], state["step"]
@@ -210,8 +211,9 @@ class SplatOptimizer:
             if adam[name] and adam[name]["step"].shape != ():
                 raise ValueError(f"{name}: Adam's step must be a scalar")
         for name in PARAMETERS:
-            self.gaussians[name] = values[name].detach().requires_grad_()
-            self.adam[name] = dict(adam[name])
+            device = self.gaussians[name].device
+            self.gaussians[name] = values[name].detach().to(device).requires_grad_()
+            self.adam[name] = {key: moment.to(device) for key, moment in adam[name].items()}
         self.steps_done = int(state["steps_done"])
         self._set_rates()
 

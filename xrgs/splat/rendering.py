@@ -1,14 +1,15 @@
-"""Rendering: Gaussians and a camera in, an image out, on either backend."""
+"""Rendering: Gaussians and a camera in, an image out, on any backend."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 from torch import Tensor
 
-from xrgs.splat.backend import implementation
+from xrgs.splat.backend import DEVICES, implementation
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import ActivatedGaussians, Gaussians
 from xrgs.splat.settings import RasterSettings
@@ -24,8 +25,7 @@ _SHAPES: dict[str, tuple[int, ...]] = {
     "means2d_offset": (2,),
 }
 
-#: All elements of every offset that `zero_means2d_offset` makes.
-_ZERO = torch.zeros((), dtype=torch.float32)
+_CPU = torch.device("cpu")
 
 
 @dataclass(frozen=True)
@@ -65,8 +65,8 @@ def rasterize(
         settings: How Gaussians become pixels; None takes the defaults of `RasterSettings`.
         sh_degree: Highest band of the spherical harmonics that is evaluated, 0 to 3; None takes all
             bands that are stored, up to `settings.sh_degree`.
-        backend: `native`, `torch`, or `auto`: native for float32 where the extension was built,
-            else torch.
+        backend: `native`, `torch`, `gsplat` (on a GPU), or `auto`: native for float32 where the
+            extension was built, else torch.
 
     Returns:
         The render, with `image` [H, W, 3], which starts at 0 and is not clamped at 1, `alpha`
@@ -75,7 +75,7 @@ def rasterize(
     Raises:
         ValueError: A parameter has a wrong shape or type, or values that are not finite, or
             `sh_degree` is above the bands that are stored. The message names the parameter.
-        XrgsError: The native backend is named and was not built.
+        XrgsError: The backend is named and can't be used on this machine (`resolve_backend`).
 
     Examples:
         >>> render = rasterize(gaussians, camera)
@@ -135,7 +135,7 @@ def rasterize_parameters(
             gradient that densification reads (with `settings.absgrad`, of absolute values).
         raw: Whether scales and opacities are raw parameters. The native backend activates them as
             it reads them, with the bits of `Gaussians.activated` and in less time.
-        backend: `torch`, `native` or `auto` (`resolve_backend`).
+        backend: `torch`, `native`, `gsplat` or `auto` (`resolve_backend`).
 
     Returns:
         The render, differentiable in every float argument. On the native backend it is
@@ -161,19 +161,25 @@ def rasterize_parameters(
     return render
 
 
-def zero_means2d_offset(count: int) -> Tensor:
+def zero_means2d_offset(count: int, device: torch.device = _CPU) -> Tensor:
     """Return a `means2d_offset` of zeros that gathers the image-plane gradient of N Gaussians.
 
     Returns:
         [N, 2] leaf that requires a gradient, float32. All its elements are one number in memory:
         the native backend knows them for zeros and does not read them.
     """
-    return _ZERO.expand(count, 2).requires_grad_()
+    return _zero(device).expand(count, 2).requires_grad_()
 
 
 def is_zero_offset(offset: Tensor | None) -> bool:
     """Whether an offset is one that `zero_means2d_offset` has made."""
-    return offset is not None and offset.data_ptr() == _ZERO.data_ptr()
+    return offset is not None and offset.data_ptr() == _zero(offset.device).data_ptr()
+
+
+@cache
+def _zero(device: torch.device) -> Tensor:
+    """All elements of every offset that `zero_means2d_offset` makes on a device."""
+    return torch.zeros((), dtype=torch.float32, device=device)
 
 
 def backend_for(means: Tensor, backend: str) -> str:
@@ -181,16 +187,18 @@ def backend_for(means: Tensor, backend: str) -> str:
 
     Args:
         means: [N, 3] any parameter of the Gaussians.
-        backend: `native`, `torch` or `auto`.
+        backend: `native`, `torch`, `gsplat` or `auto`.
 
     Returns:
         `backend`; for `auto` and another type than float32, `torch`.
 
     Raises:
-        ValueError: The tensor is not on the CPU.
+        ValueError: The tensor is on another device than the backend's.
     """
-    if means.device.type != "cpu":
-        raise ValueError(f"means is on {means.device}: xrgs renders on the CPU, use means.cpu()")
+    where = DEVICES.get(backend, "cpu")
+    if means.device.type != where:
+        renderer = "xrgs renders on the CPU" if where == "cpu" else f"gsplat renders on {where}"
+        raise ValueError(f"means is on {means.device}: {renderer}, use means.to({where!r})")
     return "torch" if backend == "auto" and means.dtype != torch.float32 else backend
 
 

@@ -154,16 +154,19 @@ class CostEstimator:
         )
 
     def cost(self, conf: Conf, variant_id: str | None, threads: int) -> Cost | None:
-        """Return the expected cost of a cell; None if the store has no finished cell.
+        """Return the expected cost of a cell; None if the store has no finished cell of its kind.
 
         Args:
             conf: The cell's config.
             variant_id: The id of its variant; None while the variant is not built.
             threads: Number of threads that train it.
         """
-        if not self._finished:
-            return None
         backend = resolve_backend(conf.splat.backend)
+        # Times of a GPU and of a processor say nothing about each other.
+        on_gpu = backend == "gsplat"
+        finished = [past for past in self._finished if (past.backend == "gsplat") == on_gpu]
+        if not finished:
+            return None
         settings, here = _settings(conf), this_processor(backend)
 
         def distance(past: _Finished) -> int:
@@ -174,9 +177,9 @@ class CostEstimator:
                 + _OTHER_BACKEND * (past.backend != backend)
             )
 
-        distances = [distance(past) for past in self._finished]
+        distances = [distance(past) for past in finished]
         least = min(distances)
-        nearest = [p for p, far in zip(self._finished, distances, strict=True) if far == least]
+        nearest = [p for p, far in zip(finished, distances, strict=True) if far == least]
         sizes = None
         if variant_id is not None:
             with suppress(StoreError):
@@ -193,7 +196,8 @@ def _scaled(past: _Finished, conf: Conf, sizes: _Sizes, threads: int, backend: s
     if backend != past.backend:
         step *= TORCH_SLOWDOWN if backend == "torch" else 1 / TORCH_SLOWDOWN
     training = past.training_s * conf.train.steps / past.steps * step
-    training *= max(1, past.threads) / max(1, threads)
+    if backend != "gsplat":
+        training *= max(1, past.threads) / max(1, threads)
     overhead = past.overhead_s * sizes.largest / past.sizes.largest
     seconds = training + overhead
     # A cell of an older version held more of its photographs; then this is too much.

@@ -26,7 +26,7 @@ _MAX_LISTED = 6
 #: Entries of a cell's provenance that are shown; the others are in `provenance.json`.
 _PROVENANCE = (
     *("started", "xrgs", "git", "git_diff_sha256", "backend", "threads", "cpu", "platform"),
-    "machines_in_turn",
+    *("gpu", "machines_in_turn"),
 )
 #: Columns that name a cell. All others hold its settings.
 _NAMES = frozenset({"cell_id", "scene", "label", "condition", "variant"})

@@ -25,7 +25,7 @@ from xrgs.composing import escape_interpolations
 from xrgs.errors import XrgsError
 from xrgs.experiment.attempts import plan_cell
 from xrgs.runtime import lease
-from xrgs.runtime.machine import usable_cores
+from xrgs.runtime.machine import gpus, usable_cores
 from xrgs.runtime.progress import log_line
 from xrgs.safeio.paths import user_path
 from xrgs.safeio.sanitize import counted, for_line
@@ -125,6 +125,42 @@ CAPACITIES: dict[str, Callable[[DictConfig, int, int], Capacity]] = {
     "SlurmLauncher": _submitit_slurm,
     "RayLauncher": _ray,
 }
+
+
+def one_cell_a_gpu(launcher: DictConfig, allowed: Capacity, count: int) -> Capacity:
+    """Return a capacity for cells that each take a GPU (`splat.backend=gsplat`).
+
+    SLURM and Ray are asked for a GPU a job, unless the launcher's settings ask for some already.
+    Other launchers run no more jobs at once than this machine has GPUs; a job takes a free one
+    (`xrgs.sweep.jobs.job`). A launcher that is not in `CAPACITIES` decides by itself.
+
+    Args:
+        launcher: `hydra.launcher`.
+        allowed: The capacity without GPUs.
+        count: Number of GPUs of this machine.
+
+    Raises:
+        XrgsError: The jobs run on this machine, and it has no GPU.
+    """
+    settings = dict(allowed.settings)
+    kind = str(launcher["_target_"]).rpartition(".")[2]
+    if kind == "SlurmLauncher":
+        if not any(launcher.get(key) for key in ("gres", "gpus_per_node", "gpus_per_task")):
+            settings["gres"] = "gpu:1"
+    elif kind == "RayLauncher":
+        settings["ray.remote.num_gpus"] = launcher["ray"]["remote"].get("num_gpus") or 1
+    if allowed.at_once is None:
+        return replace(allowed, settings=settings)
+    if count == 0:
+        raise XrgsError(
+            "splat.backend=gsplat: this machine has no GPU: nvidia-smi lists none, or"
+            " CUDA_VISIBLE_DEVICES hides them"
+        )
+    at_once = min(allowed.at_once, count)
+    if "n_jobs" in settings:
+        settings["n_jobs"] = at_once
+    batch = None if allowed.batch is None else at_once
+    return replace(allowed, at_once=at_once, batch=batch, settings=settings)
 
 
 def capacity(launcher: DictConfig, threads: int, machine: int) -> Capacity:
@@ -239,7 +275,10 @@ class Launches:
         self._session = session = self._session or self._begin(store)
         cells = sorted(cells, key=expected_length, reverse=True)
         threads, machine = max(cell.conf.threads for cell in cells), usable_cores()
-        allowed = capacity(self._config.hydra.launcher, threads, machine)
+        launcher = self._config.hydra.launcher
+        allowed = capacity(launcher, threads, machine)
+        if any(cell.conf.splat.backend == "gsplat" for cell in cells):
+            allowed = one_cell_a_gpu(launcher, allowed, len(gpus()))
         for key, value in allowed.settings.items():
             self._set(f"launcher.{key}", value)
         outcomes: dict[str, str] = {}

@@ -173,7 +173,7 @@ def _split_off_tensors(state: State, path: str, arrays: dict[str, NDArray[Any]])
     plain: State = {}
     for name, value in state.items():
         if isinstance(value, torch.Tensor):
-            arrays[path + name] = value.detach().numpy()
+            arrays[path + name] = value.detach().cpu().numpy()
         elif isinstance(value, dict):
             plain[name] = _split_off_tensors(value, f"{path}{name}/", arrays)
         else:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from xrgs.runtime.progress import progress
-from xrgs.splat.backend import resolve_backend
+from xrgs.splat.backend import device, resolve_backend
 from xrgs.splat.gaussians import PARAMETERS, Gaussians, from_points
 from xrgs.splat.loss import Target, photometric_loss, prepare_target
 from xrgs.splat.optimizer import SplatOptimizer
@@ -52,7 +52,7 @@ def train(
     extra_components: Iterable[Component] = (),
     evaluate: Evaluate | None = None,
 ) -> TrainingResult:
-    """Train one configuration. The same data, config and seed give the same bits.
+    """Train one configuration. The same data, config and seed give the same bits on the CPU.
 
     Args:
         data: The views to train on and the points to start from.
@@ -65,12 +65,12 @@ def train(
             they would be saved. Its time does not count as training time.
 
     Returns:
-        The trained Gaussians and the record of the training.
+        The trained Gaussians, on the CPU, and the record of the training.
 
     Raises:
         CheckpointError: The state that was read does not fit this config and data.
-        XrgsError: A component's value is out of range, a view is too small for a component, or
-            the components leave no view to train on.
+        XrgsError: A component's value is out of range, a view is too small for a component, the
+            components leave no view to train on, or the backend can't be used on this machine.
     """
     checkpoint = checkpoint or Checkpoint()
     run = _set_up(data, conf, extra_components)
@@ -90,7 +90,7 @@ def train(
     gaussians = run.optimizer.gaussians
     run.components.bake(gaussians)
     run.components.after_training(gaussians)
-    return run.recorder.finish(gaussians, run.memory.largest_bytes)
+    return run.recorder.finish(gaussians.to("cpu"), run.memory.largest_bytes)
 
 
 class _Views:
@@ -203,7 +203,7 @@ def _forward(run: _Run, step: Step) -> _Forward:
     components, gaussians, ssim = run.components, run.optimizer.gaussians, run.splat.ssim_weight
     camera = components.render_camera(step.view.camera, step)
     sh_degree = run.renderer.sh_degree(step)
-    means2d_offset = zero_means2d_offset(len(gaussians))
+    means2d_offset = zero_means2d_offset(len(gaussians), gaussians.means.device)
     target, kept = run.views.target(step.view), step.view.name in run.views.moments.kept
     with run.memory.of_forward(step, len(gaussians), sh_degree, kept=kept):
         render = run.renderer.render(gaussians, step, camera, means2d_offset)
@@ -268,6 +268,9 @@ def _set_up(data: Dataset, conf: Conf, extra_components: Iterable[Component]) ->
     """Build everything that the steps use."""
     splat, steps = conf.splat, conf.train.steps
     backend = resolve_backend(splat.backend)
+    place = device(backend)
+    # The points stay on the CPU: what is computed of them is computed once.
+    data = replace(data, train=tuple(view.to(place) for view in data.train))
     gaussians = from_points(
         data.points,
         data.colors,
@@ -275,7 +278,7 @@ def _set_up(data: Dataset, conf: Conf, extra_components: Iterable[Component]) ->
         init_scale=splat.init_scale,
         sh_degree=splat.raster.sh_degree,
         generator=seeded_generator(conf.seed, "init"),
-    )
+    ).to(place)
     optimizer = SplatOptimizer(
         gaussians, splat.optimizer, scene_scale=data.scene_scale, steps=steps, backend=backend
     )
@@ -308,5 +311,5 @@ def _set_up(data: Dataset, conf: Conf, extra_components: Iterable[Component]) ->
         ),
         recorder=recorder,
         renderer=StepRenderer(components, splat.raster, sh_every, backend, recorder),
-        memory=TrainingMemory(optimizer, strategy, components, views, data),
+        memory=TrainingMemory(optimizer, strategy, components, views, data, device=place),
     )

@@ -71,7 +71,7 @@ class TrainingMemory:
     step's view for the loss, the tensors of the components, what autograd saves between forward and
     backward, and the buffers of the renderer. All count as if they existed at once; tensors that
     share their memory count once. What forward and backward allocate and free in between does not
-    count.
+    count. On a GPU the count is the most that torch has allocated there, all of this included.
 
     Steps with the same number of Gaussians and harmonics, on views of one size and class whose
     moments are all kept or all not, hold the same. Only the first of them is counted.
@@ -80,13 +80,17 @@ class TrainingMemory:
         largest_bytes: The largest count so far.
     """
 
-    def __init__(self, *holders: object) -> None:
+    def __init__(self, *holders: object, device: str = "cpu") -> None:
         """Start with nothing counted.
 
         Args:
             holders: Objects that hold tensors throughout training, in their attributes or items.
+            device: Where training has its tensors: `cpu` or `cuda`.
         """
         self.holders = holders
+        self.device = device
+        if device == "cuda":
+            torch.cuda.reset_peak_memory_stats()
         self.largest_bytes = 0
         self._counted: set[str] = set()
         self._noted: tuple[str, int] | None = None
@@ -108,7 +112,8 @@ class TrainingMemory:
         size = f"{camera.width} x {camera.height} px"
         kind = f"{gaussians} {sh_degree} {step.view.tag} {size} {kept} {logged}"
         self._noted = None
-        if kind in self._counted:
+        # On a GPU without hooks: with them, gsplat 1.5.3 loses the gradients of its `absgrad`.
+        if kind in self._counted or self.device == "cuda":
             yield
             return
         packed: list[weakref.ref[Tensor]] = []
@@ -139,6 +144,8 @@ class TrainingMemory:
 
         A step without a backward pass is not counted: another of its kind holds more.
         """
+        if self.device == "cuda":
+            self.largest_bytes = max(self.largest_bytes, torch.cuda.max_memory_allocated())
         if self._noted is not None:
             kind, saved_bytes = self._noted
             held = sum(_storages(tensors_in(self.holders)).values())

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
+from xrgs.runtime.machine import wait_for_gpu
 from xrgs.splat.strategy.refinement import Refinement
 from xrgs.training.work import StepWork
 
@@ -89,6 +90,7 @@ class TrainingRecorder:
         Args:
             stage: A key of `TrainingResult.stage_seconds`.
         """
+        wait_for_gpu()
         now = time.perf_counter()
         self.stage_seconds[stage] += now - self.lap_started
         self.lap_started = now

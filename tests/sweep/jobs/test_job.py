@@ -6,6 +6,7 @@ import errno
 import json
 import os
 import shutil
+import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,7 @@ from xrgs.sweep.jobs.job import (
     STORE_FULL,
     UNKNOWN,
     UNWRITABLE,
+    _own_gpu,
     run_job,
 )
 from xrgs.sweep.session import SweepSession
@@ -242,7 +244,9 @@ def test_a_cell_ends_with_its_sweep_or_its_lease_and_is_unfinished(
     monkeypatch: pytest.MonkeyPatch,
     outcome: str,
 ) -> None:
-    def train(_: str, __: object, ___: object, on_poll: Callable[[int], None]) -> None:
+    def train(
+        _: str, __: object, ___: object, on_poll: Callable[[int], None], *____: object
+    ) -> None:
         on_poll(0)
         if outcome == STOPPED:
             monkeypatch.setattr(lease.Owner, "lives", False)
@@ -312,7 +316,9 @@ def test_a_job_whose_lease_was_taken_over_writes_nothing_from_then_on(
     cell_id = cells.plan(fail_fast=True).id
     before = {}
 
-    def train(_: str, __: object, ___: object, on_poll: Callable[[int], None]) -> None:
+    def train(
+        _: str, __: object, ___: object, on_poll: Callable[[int], None], *____: object
+    ) -> None:
         on_poll(0)
         take_over(cells.store, cell_id)
         before["cell"], before["locks"] = (
@@ -432,7 +438,9 @@ def test_a_store_that_vanishes_while_a_cell_trains_does_not_reappear(
     how: str,
     seen: str,
 ) -> None:
-    def train(_: str, __: object, ___: object, on_poll: Callable[[int], None]) -> None:
+    def train(
+        _: str, __: object, ___: object, on_poll: Callable[[int], None], *____: object
+    ) -> None:
         on_poll(0)
         cells.store.path.rename(tmp_path / "moved")
         if how == "deleted":
@@ -501,3 +509,37 @@ def test_the_command_hands_a_cell_s_id_to_its_job(
     job_config.cell = cells.plan().id
     assert command._run_job(job_config) == "done"
     assert len(requests) == 1
+
+
+def test_jobs_of_one_machine_have_a_gpu_each(
+    session: SweepSession, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "GPU-a,GPU-b")
+    third: list[Mapping[str, str]] = []
+
+    def run_third() -> None:
+        with _own_gpu(session, "gsplat") as environment:
+            third.append(environment)
+
+    waiting = threading.Thread(target=run_third)
+    with _own_gpu(session, "gsplat") as first:
+        assert first == {"CUDA_VISIBLE_DEVICES": "GPU-a"}
+        with _own_gpu(session, "gsplat") as second:
+            assert second == {"CUDA_VISIBLE_DEVICES": "GPU-b"}
+            waiting.start()
+            waiting.join(0.5)
+            assert not third
+        waiting.join()
+        assert third == [second]
+    assert not list((session.folder / "gpus").iterdir())
+    session.end()
+    assert not session.folder.exists()
+
+
+@pytest.mark.parametrize(("visible", "backend"), [("3", "gsplat"), ("0,1", "native")])
+def test_a_job_without_a_choice_of_gpus_leaves_the_variable(
+    session: SweepSession, monkeypatch: pytest.MonkeyPatch, visible: str, backend: str
+) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
+    with _own_gpu(session, backend) as environment:
+        assert environment == {}

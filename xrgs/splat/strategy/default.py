@@ -148,7 +148,8 @@ class DefaultStrategy(Strategy):
                     f"{name} must be {current.dtype} {list(current.shape)}, got {value.dtype}"
                     f" {list(value.shape)}"
                 )
-        self.grad2d_sum, self.visible_count = state["grad2d_sum"], state["visible_count"]
+        for name in ("grad2d_sum", "visible_count"):
+            setattr(self, name, state[name].to(self.gaussians.means.device))
         self.generator.set_state(state["generator"])
 
     def _deciding_thresholds(self, group: str) -> dict[str, Thresholds]:
@@ -250,7 +251,7 @@ class DefaultStrategy(Strategy):
         self.optimizer.append(
             {name: torch.cat([copies[name], halves[name]]) for name in PARAMETERS}
         )
-        index = torch.arange(len(growing))
+        index = torch.arange(len(growing), device=growing.device)
         parents = torch.cat([index[~split], index[duplicate], index[split].repeat(2)])
         return {"duplicated": int(duplicate.sum()), "split": int(split.sum())}, parents
 

@@ -149,8 +149,9 @@ class MCMCStrategy(Strategy):
     def _draw(self, opacities: Tensor, count: int) -> Tensor:
         """Draw indices [count] of opacities [N] in proportion to them, with repetition."""
         # In double: the sums of float32 depend on how torch adds.
-        weights = opacities.double()
-        return torch.multinomial(weights, count, replacement=True, generator=self.generator)
+        weights = opacities.double().cpu()  # where the generator is
+        drawn = torch.multinomial(weights, count, replacement=True, generator=self.generator)
+        return drawn.to(opacities.device)
 
     def _share_out(self, chosen: Tensor, opacities: Tensor) -> None:
         """Give the Gaussians `chosen` [M] the opacity and scales that they share with copies.
@@ -213,4 +214,5 @@ def share_out(opacities: Tensor, shares: Tensor) -> tuple[Tensor, Tensor]:
     shares = shares.clamp_max(MOST_SHARES)
     shared = -torch.expm1(torch.log1p(-opacities) / shares)
     powers = shared[:, None].expand(-1, MOST_SHARES).cumprod(dim=1)  # [M, m - 1]
-    return shared, opacities / (_COEFFICIENTS[shares] * powers).sum(dim=1)
+    coefficients = _COEFFICIENTS.to(shares.device)[shares]  # [M, m - 1]
+    return shared, opacities / (coefficients * powers).sum(dim=1)

@@ -129,8 +129,9 @@ def split_along_longest_axis(old: Mapping[str, Tensor], scales: Tensor) -> dict[
     shrink = torch.full_like(scales, math.log(SHORT_AXES_SHRINK))
     shrink.scatter_(-1, longest, math.log(LONG_AXIS_SHRINK))
     # logit(f sigmoid(x)), in double, since float32's logarithms depend on the processor.
-    rest = torch.tensor(math.log(1 - HALF_OPACITY), dtype=torch.float64)
-    logits = math.log(HALF_OPACITY) - torch.logaddexp(rest, -old["opacities"].double())
+    opacities = old["opacities"].double()
+    rest = opacities.new_tensor(math.log(1 - HALF_OPACITY))
+    logits = math.log(HALF_OPACITY) - torch.logaddexp(rest, -opacities)
     halves = {name: torch.cat([value, value]) for name, value in old.items()}
     halves["means"] = torch.cat([old["means"] + offset, old["means"] - offset])
     halves["scales"] = (old["scales"] + shrink).repeat(2, 1)

@@ -17,7 +17,7 @@ def resize(image: Tensor, height: int, width: int, variances: Tensor | None = No
     columns = bicubic_matrix(image.shape[1], width)  # [width, W]
     if variances is not None:
         rows, columns = rows @ _blur(rows, variances[0]), columns @ _blur(columns, variances[1])
-    return torch.einsum("ih,hwc,jw->ijc", rows.to(image.dtype), image, columns.to(image.dtype))
+    return torch.einsum("ih,hwc,jw->ijc", rows.to(image), image, columns.to(image))
 
 
 def _blur(resampled: Tensor, variance: Tensor) -> Tensor:

@@ -5,12 +5,17 @@ A cell that fails is a state and not an exception, so that no launcher drops the
 
 from __future__ import annotations
 
+import socket
+import time
+from contextlib import contextmanager
+from itertools import cycle
 from typing import TYPE_CHECKING
 
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.experiment.attempts import begin_attempt
 from xrgs.experiment.identity import changed_code
 from xrgs.runtime import lease
+from xrgs.runtime.machine import gpus
 from xrgs.runtime.progress import log_line
 from xrgs.safeio.files import is_transient
 from xrgs.splat.backend import arithmetic
@@ -19,6 +24,7 @@ from xrgs.sweep.jobs import worker
 from xrgs.sweep.jobs.supervise import Limits
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from xrgs.config import Conf
@@ -41,6 +47,10 @@ _NO_FAULT = {
     worker.UnwritableError: UNWRITABLE,
     UnreadableError: UNKNOWN,
 }
+
+
+#: Seconds between two looks for a free GPU.
+_GPU_POLL_S = 0.2
 
 
 class _CellLeftError(XrgsError):
@@ -187,7 +197,8 @@ def _train_in_child(
     limits = Limits(conf.limits.minutes, conf.limits.memory_gb)
     try:
         request = worker.cell_request(variant, cell)
-        answer = worker.run_in_child("cell", request, limits, on_poll)
+        with _own_gpu(session, conf.splat.backend) as environment:
+            answer = worker.run_in_child("cell", request, limits, on_poll, environment)
     except _CellLeftError as error:
         return error.outcome
     except XrgsError as error:
@@ -195,6 +206,30 @@ def _train_in_child(
     for line in answer["found"]:
         log_line(f"{cell.id}: {line}")
     return cell.state().name
+
+
+@contextmanager
+def _own_gpu(session: SweepSession, backend: str) -> Iterator[dict[str, str]]:
+    """Hold one of the GPUs that this job sees; yield the variable that shows it to the child.
+
+    Clusters show a job the GPU that it has asked for. On one machine all jobs of a sweep see all
+    GPUs, and run no more at once than there are (`xrgs.sweep.launch.one_cell_a_gpu`).
+    """
+    names = gpus() if backend == "gsplat" else []
+    if len(names) < 2:
+        yield {}
+        return
+    folder, host = session.folder / "gpus", socket.gethostname()
+    folder.mkdir(exist_ok=True)
+    for name in cycle(names):
+        held = lease.acquire(folder, f"{host} {name}")
+        if held is not None:
+            try:
+                yield {"CUDA_VISIBLE_DEVICES": name}
+            finally:
+                held.release()
+            return
+        time.sleep(_GPU_POLL_S)
 
 
 def _after_error(error: XrgsError, store: Store, folder: CellFolder, held: lease.Lease) -> str:

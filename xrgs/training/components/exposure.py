@@ -104,7 +104,7 @@ class Exposure(Component):
 
     def match_colors(self, image: Tensor, step: Step) -> Tensor:
         """Return the render [H, W, 3] in the colours of its photograph."""
-        colors = self.map_of(step.view.name).to(image.dtype)
+        colors = self.map_of(step.view.name).to(image)
         if torch.is_grad_enabled():  # other renders are looked at, and teach nothing
             self.drawn = colors.requires_grad_()
             step.log["exposure.gain"] = _gain(colors)
@@ -117,7 +117,7 @@ class Exposure(Component):
             return
         at, settings = self.names.index(step.view.name), self.settings
         maps = self.deviations.values
-        gradient = self.drawn.grad.double() + 2 * settings.prior * maps[at]
+        gradient = self.drawn.grad.to(maps) + 2 * settings.prior * maps[at]
         rate = settings.lr * settings.lr_final ** (step.number / step.total)
         self.deviations.update(at, gradient * self.learned, rate)
         # Written out: the order in which torch adds depends on the processor.

@@ -139,7 +139,7 @@ class Floaters(Component):
         if self.settings.near_share == 0 or not due:
             return None
         means = gaussians.means.detach()
-        too_near = torch.zeros(len(gaussians), dtype=torch.bool)
+        too_near = torch.zeros(len(gaussians), dtype=torch.bool, device=means.device)
         for name, camera in self.cameras.items():
             _, _, depth, inside = camera.in_image(means)
             too_near |= inside & (depth < self.settings.near_share * self.near[name])

@@ -161,7 +161,8 @@ class Mip(Component):
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore what `state_dict` returned."""
-        self.variance, self.baked = state["variance"], bool(state["baked"])
+        self.variance = state["variance"].to(self.variance.device)
+        self.baked = bool(state["baked"])
 
     def _update_variance(self, means: Tensor) -> None:
         rates = sampling_rates(means.detach(), self.cameras, self.near, self.masks)

@@ -139,7 +139,7 @@ class NaturalSelection(Component):
         if not (self.done or _is_due(step, self.drop_every)):
             return None
         logits = gaussians.opacities.detach()
-        lowest = torch.zeros(len(gaussians), dtype=torch.bool)
+        lowest = torch.zeros_like(logits, dtype=torch.bool)
         lowest[torch.argsort(logits, stable=True)[:excess]] = True
         return lowest if self.done else lowest & (logits < _LOGIT_OF_DEATH)
 

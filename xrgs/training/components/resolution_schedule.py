@@ -154,7 +154,8 @@ class ResolutionSchedule(Component):
         camera = view.camera.resized(width, height)
         mask = None
         if view.mask is not None:
-            mask = torch.from_numpy(masks.resized(view.mask.numpy(), width, height))
+            resized = masks.resized(view.mask.cpu().numpy(), width, height)
+            mask = torch.from_numpy(resized).to(view.mask.device)
         return _ReducedView(view.name, view.tag, view.rho, camera, image, mask, view.need)
 
 
@@ -171,7 +172,7 @@ def kept_shares(images: Iterable[Tensor], factors: Iterable[int]) -> dict[int, f
     """
     total, sums = 0.0, dict.fromkeys(factors, 0.0)
     for image in images:
-        spectrum = torch.fft.fft2(image.double(), dim=(0, 1)).abs().sum(dim=2)  # [H, W]
+        spectrum = torch.fft.fft2(image.cpu().double(), dim=(0, 1)).abs().sum(dim=2)  # [H, W]
         total += spectrum.sum().item()
         fy, fx = (torch.fft.fftfreq(size, dtype=torch.float64).abs() for size in spectrum.shape)
         for factor in sums:

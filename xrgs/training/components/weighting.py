@@ -288,7 +288,7 @@ class _RegionAttenuation:
 
     def __call__(self, view: TrainingView) -> Tensor:
         share = _box_mean(gradient_magnitude(view.image), view.mask) / self.texture
-        attenuation = share.clamp_max(1.0) * self.covered[view.name]
+        attenuation = share.clamp_max(1.0) * self.covered[view.name].to(share.device)
         if view.mask is None:
             return attenuation
         # Outside there is no loss to attenuate; with the mean of the inside, the mean of the view

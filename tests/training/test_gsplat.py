@@ -1,0 +1,159 @@
+"""Training with `splat.backend=gsplat`: as on the native backend, and with nothing on the CPU.
+
+gsplat's kernels need a GPU. `xrgs.rasterization` stands in for them, and a device that has a GPU's
+rules for the GPU (`tests/fake_gpu.py`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from tests.conftest import composed as compose
+from tests.fake_gpu import DEVICE, fake_gpu
+from tests.gsplat_stand_in import ALPHA_MAX, stand_in
+from tests.training.conftest import comparable
+from tests.training.test_loop import ABLATIONS
+from xrgs.capture.dataset import Dataset
+from xrgs.config import Conf
+from xrgs.evaluation import protocol
+from xrgs.splat.gaussians import PARAMETERS
+from xrgs.splat.loss import photometric_loss
+from xrgs.training import loop
+from xrgs.training.checkpoint import Checkpoint
+from xrgs.training.loop import train
+from xrgs.training.memory import TrainingMemory
+
+pytest.importorskip("xrgs._native", reason="the kernels were not built")
+
+#: Settings without which an ablation does nothing in so few steps on so few Gaussians.
+WITH = {
+    "exposure_gain": ["components.exposure.mode=gain"],
+    "mcmc": ["splat.densify.budget=0.03"],
+    "near_limit": ["components.floaters.near_share=1"],
+    "natural_selection": [
+        "components.natural_selection.budget=0.003",
+        "splat.densify.stop=10000",
+    ],
+    "count_matched": [
+        "components.count_matched.gaussians=40",
+        "components.count_matched.tolerance=1000",
+    ],
+}
+#: The ablations that have most of the components between them; the others are marked slow.
+FAST = ("xrgs", "plus", "mcmc", "exposure", "region_weighting", "natural_selection")
+
+
+def config(ablation: str, *changes: str, backend: str = "gsplat") -> Conf:
+    return compose(f"+ablation={ablation}", f"splat.backend={backend}", ALPHA_MAX, *changes)
+
+
+@pytest.mark.parametrize("ablation", ["baseline", "xrgs", "plus"])
+def test_fifty_steps_are_those_of_the_native_backend(data: Dataset, ablation: str) -> None:
+    # The first Gaussians are round, and the gradients of their rotations are rounding only. With
+    # gsplat's eps of 1e-15, Adam would make whole steps of it.
+    changes = ("train.steps=50", "splat.densify.every=5000", "splat.optimizer.eps=1e-5")
+    native = train(data, config(ablation, *changes, backend="native"))
+    with stand_in():
+        theirs = train(data, config(ablation, *changes))
+    assert len(native.gaussians) == len(theirs.gaussians) != 60  # densification took part
+    for name in PARAMETERS:
+        torch.testing.assert_close(
+            theirs.gaussians[name], native.gaussians[name], rtol=1e-4, atol=2e-5
+        )
+    for row, expected in zip(theirs.history, native.history, strict=True):
+        assert row == {
+            name: pytest.approx(value, rel=1e-3, abs=1e-5) if isinstance(value, float) else value
+            for name, value in expected.items()
+        }
+
+
+def masked(data: Dataset) -> Dataset:
+    """The dataset with a third of every photograph outside a mask."""
+    views = []
+    for view in data.train:
+        mask = torch.ones(view.camera.height, view.camera.width, dtype=torch.bool)
+        mask[: len(mask) // 3] = False
+        views.append(dataclasses.replace(view, mask=mask))
+    return dataclasses.replace(data, train=tuple(views))
+
+
+@pytest.mark.parametrize(
+    "ablation",
+    [name if name in FAST else pytest.param(name, marks=pytest.mark.slow) for name in ABLATIONS],
+)
+def test_training_leaves_no_tensor_on_the_processor(data: Dataset, ablation: str) -> None:
+    changes = ("train.steps=12", "splat.densify.every=5000", *WITH.get(ablation, []))
+    with stand_in(DEVICE.type), fake_gpu():
+        result = train(masked(data), config(ablation, *changes))
+    assert {result.gaussians[name].device.type for name in PARAMETERS} == {"cpu"}
+    assert all(torch.isfinite(result.gaussians[name]).all() for name in PARAMETERS)
+
+
+class Kill(BaseException):
+    """Ends a run as a kill does."""
+
+
+@pytest.mark.parametrize("ablation", ["plus", pytest.param("xrgs", marks=pytest.mark.slow)])
+def test_a_killed_run_continues(
+    data: Dataset, ablation: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    conf, calls = config(ablation, "train.steps=12", "splat.densify.every=7500"), [0]
+
+    def mortal(*arguments: Any, **named: Any) -> Any:
+        calls[0] += 1
+        if calls[0] == 18:
+            raise Kill
+        return photometric_loss(*arguments, **named)
+
+    def checkpoint() -> Checkpoint:
+        return Checkpoint(tmp_path / "checkpoint.npz", "cell", every_s=1e-9)
+
+    monkeypatch.setattr(loop, "photometric_loss", mortal)
+    with stand_in(DEVICE.type), fake_gpu():
+        whole = train(data, conf)
+        with pytest.raises(Kill):
+            train(data, conf, checkpoint())
+        continued = checkpoint()
+        assert continued.load() == 5
+        again = train(data, conf, continued)
+    assert comparable(again) == comparable(whole)
+
+
+def test_evaluation_renders_on_the_gpu_and_scores_on_the_processor(
+    data: Dataset, tmp_path: Path
+) -> None:
+    gaussians = train(data, config("baseline", "train.steps=3", backend="native")).gaussians
+    ours = protocol.mean_scores(gaussians, data.test, config("baseline", backend="native").splat)
+    conf = config("baseline").splat
+    with stand_in(DEVICE.type), fake_gpu():
+        rows = protocol.score_views(gaussians, data.test, conf, tmp_path / "renders")
+        means = protocol.mean_scores(gaussians, data.test, conf)
+        assert protocol.render_time(gaussians, data.test, conf) > 0
+    assert means["psnr"] == rows[0]["psnr"] == pytest.approx(ours["psnr"], rel=1e-5)
+    assert (tmp_path / "renders" / "v0.png").stat().st_size
+
+
+def test_memory_of_a_gpu_is_what_torch_has_allocated(monkeypatch: pytest.MonkeyPatch) -> None:
+    peak = [7]
+    monkeypatch.setattr(torch.cuda, "reset_peak_memory_stats", lambda: peak.__setitem__(0, 0))
+    monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda: peak[0])
+    memory = TrainingMemory(device="cuda")
+    assert peak == [0]
+    step: Any = dataclasses.make_dataclass("Step", ["view", "log"])
+    view: Any = dataclasses.make_dataclass("View", ["camera", "tag"])
+    camera: Any = dataclasses.make_dataclass("Camera", ["width", "height"])
+    # The hooks would hide the tensor on which gsplat 1.5.3 stores `absgrad`.
+    saved = torch.ones(3, requires_grad=True)
+    with memory.of_forward(step(view(camera(4, 4), "HR"), {}), 3, 0):
+        product = saved * saved
+    assert product.grad_fn is not None
+    assert product.grad_fn._saved_self is saved  # type: ignore[attr-defined]
+    for allocated in (50, 30):
+        peak[0] = allocated
+        memory.record(None)  # type: ignore[arg-type]
+    assert memory.largest_bytes == 50

@@ -1,0 +1,1 @@
+"""The renderer of gsplat on a GPU; all else of this backend is `xrgs/splat/torch`."""

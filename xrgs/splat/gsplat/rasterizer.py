@@ -1,0 +1,148 @@
+"""`gsplat.rasterization` [ye2025] as a rasterizer of the model, for gsplat 1.5.3 and 1.6.
+
+Importing this module loads gsplat's CUDA kernels; the first time on a machine, gsplat compiles
+them, which takes minutes.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import weakref
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from xrgs.errors import XrgsError
+from xrgs.splat.backend import DEVICES, check_raster
+from xrgs.splat.cameras import Camera
+from xrgs.splat.gaussians import ActivatedGaussians
+from xrgs.splat.rendering import Render, is_zero_offset
+from xrgs.splat.settings import RasterSettings
+from xrgs.splat.sh import bases
+from xrgs.splat.torch.activations import activate
+
+
+def _load() -> Any:
+    """Return gsplat with its kernels.
+
+    Raises:
+        XrgsError: There is no GPU, or there are no kernels; the message says what is missing.
+    """
+    if DEVICES["gsplat"] == "cuda" and not torch.cuda.is_available():
+        built = f"CUDA {torch.version.cuda}" if torch.version.cuda else "the CPU only"
+        raise XrgsError(
+            f"splat.backend=gsplat: torch {torch.__version__}, built for {built}, sees no CUDA GPU;"
+            " does nvidia-smi list one? It needs torch for its CUDA (pytorch.org)"
+        )
+    try:
+        import gsplat
+        from gsplat.cuda import _backend
+    except (ImportError, OSError, RuntimeError, subprocess.SubprocessError) as error:
+        reason = str(error).strip().partition("\n")[0]
+        raise XrgsError(
+            f"splat.backend=gsplat: gsplat's kernels can't be loaded ({reason}); to compile them"
+            " takes nvcc of torch's CUDA, a C++ compiler and ninja"
+        ) from error
+    if _backend._C is None:
+        raise XrgsError(
+            "splat.backend=gsplat: gsplat's kernels are not compiled, and there is no CUDA compiler"
+            " to do so: install the CUDA toolkit, with nvcc on the PATH or CUDA_HOME set, or a"
+            " compiled wheel of gsplat"
+        )
+    # Or the convolutions of the loss would keep 10 bits of each factor.
+    torch.backends.cudnn.allow_tf32 = False
+    return gsplat
+
+
+_gsplat = _load()
+
+
+def render(
+    gaussians: ActivatedGaussians,
+    camera: Camera,
+    settings: RasterSettings,
+    sh_degree: int,
+    means2d_offset: Tensor | None,
+    *,
+    raw: bool = False,
+) -> Render:
+    """Render Gaussians into one view as `xrgs.splat.rendering.rasterize_parameters` does.
+
+    Args:
+        gaussians: N Gaussians, float32 on the GPU, whose shapes have been checked. Values that are
+            not finite are not refused.
+        camera: The view.
+        settings: How Gaussians become pixels.
+        sh_degree: Highest band of the spherical harmonics that is on.
+        means2d_offset: [N, 2] of `zero_means2d_offset`, which gets the image-plane gradient; None
+            where that is not needed.
+        raw: Whether scales and opacities are natural logarithms and logits.
+
+    Returns:
+        The render, once differentiable in every parameter; `backward` gives the offset its `grad`.
+        A Gaussian is `visible` where its radii in px, rounded up, reach the image. `evaluations`
+        counts all pixels of a tile, finished or not. `buffer_bytes` is 0: `TrainingMemory` counts
+        what torch allocates on a GPU, which includes gsplat's buffers.
+
+    Raises:
+        ValueError: The offset is not of `zero_means2d_offset`, since gsplat adds none.
+        XrgsError: A setting differs from the constants of gsplat's kernels.
+    """
+    check_raster("gsplat", settings)
+    given = means2d_offset is not None and len(means2d_offset) > 0
+    if given and not is_zero_offset(means2d_offset):
+        raise ValueError("means2d_offset must be of zero_means2d_offset: gsplat adds no offset")
+    if raw:
+        scales, opacities = activate(gaussians.scales, gaussians.opacities)
+        gaussians = gaussians._replace(scales=scales, opacities=opacities)
+    means, quats, scales, opacities, sh0, shN = gaussians
+    if means2d_offset is not None:
+        means = _with_gradient_of(means2d_offset, means, settings.absgrad)
+    image, alpha, meta = _gsplat.rasterization(
+        means=means,
+        quats=quats,
+        scales=scales,
+        opacities=opacities,
+        colors=torch.cat([sh0, shN[:, : bases(sh_degree) - 1]], dim=1),
+        viewmats=camera.viewmat.to(means)[None],
+        Ks=camera.K.to(means)[None],
+        width=camera.width,
+        height=camera.height,
+        near_plane=settings.near,
+        eps2d=settings.eps2d,
+        sh_degree=sh_degree,
+        packed=False,
+        backgrounds=means.new_tensor([settings.background]),
+        absgrad=settings.absgrad,
+        rasterize_mode="antialiased" if settings.antialiased else "classic",
+    )
+    if means2d_offset is not None:
+        meta["means2d"].retain_grad()
+        means2d_offset.gsplat_means2d = meta["means2d"]  # type: ignore[attr-defined]
+    evaluations = len(meta["flatten_ids"]) * meta["tile_size"] ** 2
+    return Render(
+        image=image[0],
+        alpha=alpha[0, ..., 0],
+        visible=(meta["radii"][0] > 0).all(dim=-1),
+        evaluations=evaluations,
+        buffer_bytes=0,
+        tile_evaluations=evaluations,
+    )
+
+
+def _with_gradient_of(means2d_offset: Tensor, means: Tensor, absgrad: bool) -> Tensor:
+    """Return the means; their backward pass gives the offset the gradient of gsplat's `means2d`.
+
+    The gradient of the means is complete after all of gsplat's. The graph must not hold `means2d`,
+    which holds the graph: the offset does, and the graph has a weak reference to the offset.
+    """
+    means, offset_of = means.view_as(means), weakref.ref(means2d_offset)
+
+    def give(_: Tensor) -> None:
+        if (offset := offset_of()) is not None:
+            means2d = offset.gsplat_means2d  # type: ignore[attr-defined]  # [1, N, 2]
+            offset.grad = (means2d.absgrad if absgrad else means2d.grad)[0]
+
+    means.register_hook(give)
+    return means
