@@ -201,6 +201,17 @@ def _parts(text: str) -> list[str]:
     return [text[begin + 1 : end] for begin, end in pairwise([-1, *cuts, len(text)])]
 
 
+def check_no_axis(words: Sequence[str]) -> None:
+    """Refuse overrides with several values, where one cell is trained.
+
+    Raises:
+        XrgsError: An override is an axis; the message names it.
+    """
+    for word in words:
+        if (override := _parsed(word)) and override.is_sweep_override():
+            raise XrgsError(f"{word}: give one value; xrgs-sweep takes several")
+
+
 def files(group: str) -> list[str]:
     """Return the names of a config group's files, sorted; empty where there is no such group.
 

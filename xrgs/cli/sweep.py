@@ -116,9 +116,23 @@ def main() -> None:
         return
     # The plus that Hydra requires before these two is forgotten easily.
     words = ["+" + w if w.partition("=")[0] in config.PLUS_GROUPS else w for w in arguments]
+    run("xrgs-sweep", words)
+
+
+def run(command: str, words: Sequence[str]) -> None:
+    """Run a sweep.
+
+    Args:
+        command: Name of the command, which begins messages.
+        words: The arguments of `xrgs-sweep`.
+
+    Raises:
+        SystemExit: With code 1 where a cell failed; with a message where the user can correct the
+            problem.
+    """
     with (
         exit_on_signal("Finished cells are kept: run the same command again to continue."),
-        _hydra_errors("xrgs-sweep"),
+        _hydra_errors(command),
     ):
         sys.argv[1:] = with_quotes(words)
         _run_job()

@@ -63,7 +63,7 @@ class Report:
     """A report that `build` has written."""
 
     text: str
-    """The tables for a terminal, with the folder's name at the end."""
+    """The tables for a terminal, with the path of the page at the end."""
     folder: Path
     """The folder that it was written to."""
     files: tuple[Path, ...]
@@ -167,7 +167,7 @@ def build(
             " name another folder with --out"
         ) from error
     written = {p.file for p in drawn if p.file} | {folder / name for name in _FILES}
-    text = f"{_text(tables, _warnings(sweep))}\n{for_line(f'Written to {folder}')}"
+    text = f"{_text(tables, _warnings(sweep))}\n{for_line(f'Page: {folder / PAGE}')}"
     return Report(text=text, folder=folder, files=tuple(sorted(written)))
 
 
@@ -214,7 +214,7 @@ def _write(
     write_text(folder / "table.md", page)
     write_text(folder / "table.csv", _csv(tables.long()))
     write_document(
-        folder / "report.html",
+        folder / PAGE,
         store,
         sweep,
         tables,
@@ -226,9 +226,11 @@ def _write(
     return drawn
 
 
+#: The page of a report.
+PAGE = "report.html"
 #: The files of every report, beside its pictures.
 _FILES = (
-    "report.html",
+    PAGE,
     "table.md",
     "table.tex",
     "table.csv",

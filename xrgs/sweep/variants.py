@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from xrgs.capture import photographs, scenes, split, variant
+from xrgs.capture.degradations import resolve_degradation
 from xrgs.capture.description import read_report
 from xrgs.capture.folders import failed_folder, trimmed_folder
 from xrgs.config import CONF_DIR
@@ -77,7 +78,10 @@ def _build(
     An exception that `check` raises meanwhile ends the child.
     """
     _check_held_out(scenes.names(conf.scene, conf.variant.long_side), conf)  # SfM takes minutes
-    log_line(f"{scenes.label(conf.scene)}: building the mixed-resolution variant{place}")
+    work = "building the mixed-resolution variant"
+    if resolve_degradation(conf.variant) == "none":
+        work = "finding the cameras" if conf.variant.poses is None else "reading the cameras"
+    log_line(f"{scenes.label(conf.scene)}: {work}{place}")
     request = {"conf": asdict(conf), "store": str(store.path)}
     answer = worker.run_in_child("variant", request, Limits(), lambda _: check(), environment)
     return str(answer["variant"])
