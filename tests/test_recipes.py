@@ -223,4 +223,4 @@ def test_a_launcher(copy: Copy) -> None:
     )
     printed = copy.run("sweep", *SMOKE[:2], "store=s", "train.steps=2", "hydra/launcher=pool")
     assert "hydra/launcher=pool: 1 cell, threads=" in printed
-    assert "Written to" in printed
+    assert "Page: s/reports/" in printed

@@ -387,15 +387,15 @@ def photographs(folder: Path, count: int, size: tuple[int, int] = (120, 80)) -> 
             2,
             (120, 80),
             (),
-            "1 HR, 0 LR and 1 test views; .* needed. 1 of 2 photographs is held out: "
-            "variant.test_every=0 (tests are then on the training views), or add photographs",
+            "scene scene: 2 photographs are too few: 1 is held out to test on, and 1 left to train"
+            " on, which takes two. Add photographs, or hold none out: variant.test_every=0",
         ),
         (5, (40, 30), (), "0 photograph(s) can be used.*lower variant.factor to 2"),
         (
             5,
             (120, 80),
             ("variant.test=[1,2,3,4]",),
-            "1 HR, 0 LR and 4 test views; .*4 of 5 photographs are held out: name fewer or others",
+            "5 photographs are too few: 4 are held out.* or name fewer or others in variant.test",
         ),
         (5, (120, 80), ("variant.tags=megapixels",), "every training view is HR"),
     ],
@@ -423,7 +423,8 @@ def test_photographs_of_which_too_few_are_trained_on_are_refused_before_sfm(
     conf = compose("scene=folder", f"scene.path={photographs(tmp_path / 'scene', 2)}")
     monkeypatch.setattr(worker, "run_in_child", unexpected)
     planned = plan(conf, store, allow_build=True)
-    assert "1 of 2 photographs is held out: variant.test_every=0" in str(planned.error)
+    assert "1 is held out to test on" in str(planned.error)
+    assert "HR" not in str(planned.error)
     assert not planned.remembered
     monkeypatch.setattr(worker, "run_in_child", fail)  # with every photograph, SfM is tried
     conf.variant.test_every = 0

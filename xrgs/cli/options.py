@@ -21,6 +21,7 @@ from tyro.conf import CascadeSubcommandArgs, DisallowNone, FlagCreatePairsOff, O
 import xrgs
 from xrgs.config import known_keys
 from xrgs.errors import XrgsError
+from xrgs.experiment.store import DEFAULT_STORE
 from xrgs.runtime.streams import guard_streams, say
 from xrgs.safeio.paths import user_path
 from xrgs.safeio.sanitize import for_line
@@ -28,7 +29,7 @@ from xrgs.safeio.sanitize import for_line
 if TYPE_CHECKING:
     from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 
-STORE = Path("xrgs-store")
+STORE = DEFAULT_STORE
 
 
 def shown_as(metavar: str) -> object:

@@ -21,7 +21,7 @@ from xrgs.report.external import with_external
 from xrgs.report.html import write_document
 from xrgs.report.joined import Choice, JoinedStore, report_name
 from xrgs.report.markup import LATEX_PREAMBLE, to_latex, to_markdown
-from xrgs.report.paper import paper_tables, texture_tables, with_texture
+from xrgs.report.paper import paper_tables, texture_tables, why_no_table, with_texture
 from xrgs.report.photographs import photographs, with_variants
 from xrgs.report.pictures import Picture, draw
 from xrgs.report.tables import Tables
@@ -359,6 +359,8 @@ def _warnings(sweep: Sweep) -> list[str]:
     if unknown:
         warnings.append(f"{counted(unknown, 'cell')} can't be read now: run the report again.")
     warnings += _stale_warning(sweep)
+    if why := why_no_table(sweep.cells["label"], sweep.cells["scene"]):
+        warnings.append(why)
     shares = sorted({share for share in sweep.cells["validation"].dropna() if share > 0})
     if shares:
         listed = ", ".join(f"train.validation={share:g}" for share in shares)

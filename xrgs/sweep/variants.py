@@ -21,6 +21,7 @@ from xrgs.experiment.store import StoreGoneError
 from xrgs.runtime.machine import usable_cores, usable_memory
 from xrgs.runtime.progress import log_line
 from xrgs.safeio.files import is_transient
+from xrgs.safeio.sanitize import counted
 from xrgs.sweep.jobs import worker
 from xrgs.sweep.jobs.supervise import Limits
 
@@ -129,7 +130,12 @@ def how_to_get(scenes: Iterable[SceneConf]) -> str:
         + ("" if root == usual else f" --data-root {shlex.quote(str(root))}")
         for (dataset, root), names in missing.items()
     ]
-    hints = [f"to download what is missing: {'; '.join(commands)}"] if commands else []
+    hints = [
+        f"{root}/{name} is there: data_root={root}"
+        for name, path in absent.items()
+        for root in _roots_near(path)
+    ]
+    hints += [f"to download what is missing: {'; '.join(commands)}"] if commands else []
     captures = {file.stem for file in (CONF_DIR / "scene/captures").glob("*.yaml")}
     if own := [str(path) for name, path in absent.items() if name in captures]:
         hints.append(
@@ -137,6 +143,14 @@ def how_to_get(scenes: Iterable[SceneConf]) -> str:
             f" (section Scenes); they belong into {', '.join(own)}"
         )
     return "\n".join(hints)
+
+
+def _roots_near(missing: Path) -> list[str]:
+    """Return the folders beside a wrong `data_root` that have a scene: one below, or one above."""
+    root, name = missing.parent, missing.name
+    below = sorted(folder.parent for folder in root.glob(f"*/{name}") if folder.is_dir())
+    above = [root.parent] if root.name == name and root.is_dir() else []
+    return [shlex.quote(str(found)) for found in (*below, *above)]
 
 
 def find_or_build(conf: Conf, store: Store) -> str:
@@ -342,15 +356,13 @@ def _check_held_out(names: Sequence[str], conf: Conf, notes: Iterable[str] = ())
         XrgsError: There are too few; the message says what helps.
     """
     parts = split.split_views(names, conf.variant)
-    lacking = split.shortage(parts, set(range(len(names))), conf.variant)
-    if not lacking:
+    if not split.shortage(parts, set(range(len(names))), conf.variant):
         return
-    held_out = len(parts.test)
-    which = f"{held_out} of {len(names)} photographs {'is' if held_out == 1 else 'are'} held out"
-    helps = "variant.test_every=0 (tests are then on the training views)"
+    held_out, left = len(parts.test), len(parts.hr) + len(parts.lr)
+    which = f"{held_out} {'is' if held_out == 1 else 'are'} held out to test on"
+    why = f"{which}, and {left} left to train on, which takes two"
+    helps = "hold none out: variant.test_every=0, or xrgs-train --all"
     if conf.variant.test:
         helps = "name fewer or others in variant.test"
-    where = f"scene {scenes.label(conf.scene)}"
-    raise XrgsError(
-        "; ".join([f"{where}: {lacking}. {which}: {helps}, or add photographs", *notes])
-    )
+    few = f"scene {scenes.label(conf.scene)}: {counted(len(names), 'photograph')} are too few"
+    raise XrgsError("; ".join([f"{few}: {why}. Add photographs, or {helps}", *notes]))
