@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -207,4 +208,4 @@ def test_a_cell_that_fails_is_named_with_the_reason(sweep_here: RunCommand, chil
     arguments = ("scene=motorcycle", "preset=smoke", "store=s", "hydra.sweeper.brief=true")
     code, out, err = sweep_here(*arguments)
     assert (code, out) == (1, "")
-    assert "motorcycle / baseline / seed 0  (it raised)" in err
+    assert re.search(r"^  failed .* motorcycle / .* / seed 0  \(it raised\)$", err, re.MULTILINE)

@@ -59,7 +59,8 @@ def test_a_cell_is_found_by_its_scene_where_one_is_done(
     for word in ("garden", "photos/garden", "photos/garden/", "photos/garden/images"):
         assert models.find_cell(word, store).id == "abc1"
     assert models.find_cell("my bike", store).id == "abd2"
-    assert models.find_cell(str(store.cell("abc1").path), Store("gone")).id == "abc1"
+    (store.cell("abd2").path / "identity.json").write_text("{}")
+    assert models.find_cell(str(store.cell("abd2").path), Store("gone")).id == "abd2"
     assert store.find_folder("garden") == store.cell("abc1").path
     rows = store.cell_rows()
     assert [row.id for row in Selection(ids=("garden",)).of(rows)] == ["abc1"]

@@ -135,8 +135,8 @@ def _variant(words: Sequence[str]) -> Path:
 def export(
     name: Positional[Annotated[str, arg(metavar="CELL|VARIANT|FILE")]],
     layout: Annotated[
-        Literal["colmap", "nerfstudio", "ply", "glb", "spz"] | None, arg(name="format")
-    ] = None,
+        Literal["auto", "colmap", "nerfstudio", "ply", "glb", "spz"], arg(name="format")
+    ] = "auto",
     out: Annotated[Path | None, shown_as("FOLDER|FILE")] = None,
     store: Folder = STORE,
 ) -> None:
@@ -148,7 +148,7 @@ def export(
             another of these.
         layout: `ply`, `glb` (glTF with KHR_gaussian_splatting) and `spz` (8 bits a value): one file
             of Gaussians. `colmap` and `nerfstudio`: a folder of images, cameras, points and split,
-            and the splats of a cell. By default the end of --out decides; a folder is COLMAP's.
+            and the splats of a cell. `auto`: by the end of --out, where a folder is COLMAP's.
         out: The file to write, which is replaced, or a new folder; by default it is named after
             what is exported.
         store: The store.
@@ -175,13 +175,13 @@ def form_of(out: Path) -> str:
     return "colmap"
 
 
-def write_export(path: Path, out: Path | None, layout: str | None = None) -> str:
+def write_export(path: Path, out: Path | None, layout: str = "auto") -> str:
     """Write an export, and return a line on it.
 
     Args:
         path: The folder of a cell or a variant, or a file of Gaussians.
         out: The file or the folder to write; None names it after `path`.
-        layout: The format; None takes the one of `out`.
+        layout: The format; `auto` takes the one of `out`.
 
     Raises:
         XrgsError: The cell can't be exported so, or `out` can't be written.
@@ -189,7 +189,8 @@ def write_export(path: Path, out: Path | None, layout: str | None = None) -> str
     from xrgs.experiment.export import export as write
     from xrgs.experiment.export import export_splats
 
-    layout = layout or ("colmap" if out is None else form_of(out))
+    if layout == "auto":
+        layout = "colmap" if out is None else form_of(out)
     if layout in SPLAT_FORMATS:
         return export_splats(path, layout, out or Path(f"{path.stem}.{layout}"))
     if out is not None and out.suffix.lower()[1:] in SPLAT_FORMATS:

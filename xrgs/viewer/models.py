@@ -125,7 +125,12 @@ def _load(word: str, store: Store) -> Model:
         gaussians, antialiased = load_gaussians(file)
         settings = RasterSettings(antialiased=antialiased)
         return Model(for_line(file.name, _MAX_NAME), gaussians, settings)
-    cell = find_cell(word, store)
+    try:
+        cell = find_cell(word, store)
+    except StoreError:
+        if file.suffix:  # of another format: the message says which are read
+            load_gaussians(file)
+        raise
     data = cell.dataset()
     train = [PosedView(view.name, view.tag, view.camera) for view in data.train]
     test = [PosedView(view.name, "test", view.camera) for view in data.test]
