@@ -261,6 +261,8 @@ def test_a_launcher_named_in_an_ablation_is_refused(sweep_here: SweepHere, tmp_p
         (["scene=folder"], ["scene.path"]),
         (["scene=folder", "scene.path=gone"], ["gone"]),
         (["scene=folder", "scene.path=empty"], ["empty"]),
+        (["scene.path=empty"], ["write scene=folder scene.path=empty"]),
+        (["scene=motorcycle", "scene.path=a b"], ["write scene=folder 'scene.path=a b'"]),
         (["scene=folder", "scene.path=one"], ["one"]),
         (["store=in-the-way"], ["in-the-way", "store="]),
         (["train.steps=0"], ["train.steps"]),

@@ -13,6 +13,7 @@ import pytest
 from xrgs.capture.description import ALIKE_RECIPE, MIXTURE_RECIPE, Mixture, SfmReport
 from xrgs.capture.scenes import motorcycle
 from xrgs.cli import budget, sweep, train
+from xrgs.experiment.cell_folder import CellFolder
 from xrgs.experiment.store import Store
 
 RunCommand = Callable[..., tuple[int, str, str]]
@@ -31,7 +32,8 @@ def handed_over(
         monkeypatch.setattr(train, "_measured_unit", lambda _: 1e-7)
         monkeypatch.setattr(train, "_units_of_a_step", lambda *_: 1e5)
         monkeypatch.setattr(train, "_say_end", lambda *_: None)
-        monkeypatch.setattr(sweep, "run", lambda _, of: words.extend(of))
+        monkeypatch.setattr(train, "_cell", lambda *_: CellFolder(Path("absent")))
+        monkeypatch.setattr(sweep, "run", lambda _, of, __: words.extend(of))
         code, _, err = call_command("train", *arguments)
         assert code == 0, err
         return {key.lstrip("+"): value for key, _, value in (w.partition("=") for w in words)}
@@ -161,6 +163,7 @@ def test_a_dry_run_says_how_many_photographs_there_are_and_writes_nothing(
     assert code == 0, err
     assert out.splitlines()[0] == "garden: 10 photographs found"
     assert "left out: damaged.png" in out
+    assert "9 photographs: 2 held out, 7 to train on, as they are\n" in out
     assert not (tmp_path / "xrgs-store").exists()
 
 
@@ -193,7 +196,8 @@ def test_a_scene_is_made_and_its_last_lines_lead_on(
 
     code, out, err = forked_command("train", tmp_path, "my bike", "--all", *small, "--out=a.ply")
     assert code == 0, err  # found again, and exported by its name
-    assert "training" not in err
+    assert "training" not in err + out
+    assert "trained already by keep_large: 8 steps at 250 px\n" in out
     assert out.splitlines()[-1].endswith("written to a.ply")
     assert forked_command("data", tmp_path, "export", "my bike", "--out", "b.ply")[0] == 0
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()

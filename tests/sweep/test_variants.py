@@ -364,8 +364,12 @@ def test_a_dry_run_reads_the_headers_of_photographs(
     conf = compose("scene=folder", f"scene.path={scene}")
     planned = plan(conf, store, allow_build=False)
     if readable == 4:
-        (note,) = planned.notes
+        note, becomes = planned.notes
         assert note.startswith("left out: x.jpg (unreadable or truncated image")
+        assert becomes == (
+            "4 photographs: 1 held out, 3 to train on, 1 of which are made 5 times smaller;"
+            " variant.hr_fraction=1 leaves them as they are"
+        )
         assert planned == PlannedVariant(notes=planned.notes)
     else:
         assert planned.error is not None
@@ -435,11 +439,13 @@ def test_a_plan_says_that_no_view_is_lr(
     compose: Callable[..., Conf], store: Store, tmp_path: Path
 ) -> None:
     conf = compose("scene=folder", f"scene.path={photographs(tmp_path / 'scene', 3)}")
+    becomes = "3 photographs: 1 held out, 2 to train on, as they are"
     assert plan(conf, store, allow_build=False).notes == (
+        becomes,
         "no LR view: 2 training photographs are all HR by variant.min_hr=2; nothing is mixed",
     )
     conf.variant.hr_fraction = 1.0  # asked for
-    assert plan(conf, store, allow_build=False).notes == ()
+    assert plan(conf, store, allow_build=False).notes == (becomes,)
 
 
 def test_a_variant_that_is_found_says_what_the_folder_has_got_since(

@@ -127,24 +127,22 @@ def main() -> None:
         check_words(arguments)
     # The plus that Hydra requires before these two is forgotten easily.
     words = ["+" + w if w.partition("=")[0] in config.PLUS_GROUPS else w for w in arguments]
-    run("xrgs-sweep", words)
+    run("xrgs-sweep", words, "Finished cells are kept: run the same command again to continue.")
 
 
-def run(command: str, words: Sequence[str]) -> None:
+def run(command: str, words: Sequence[str], hint: str) -> None:
     """Run a sweep.
 
     Args:
         command: Name of the command, which begins messages.
         words: The arguments of `xrgs-sweep`.
+        hint: What is said where a signal ends it: what is kept, and how to continue.
 
     Raises:
         SystemExit: With code 1 where a cell failed; with a message where the user can correct the
             problem.
     """
-    with (
-        exit_on_signal("Finished cells are kept: run the same command again to continue."),
-        _hydra_errors(command),
-    ):
+    with exit_on_signal(hint), _hydra_errors(command):
         sys.argv[1:] = with_quotes(words)
         _run_job()
 

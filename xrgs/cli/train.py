@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
     from xrgs.capture.description import Mixture, SfmReport
     from xrgs.config import Conf
+    from xrgs.experiment.cell_folder import CellFolder
 
 #: The overrides of each quality.
 _QUALITIES = {
@@ -90,6 +91,11 @@ class _Words:
         words = (*self.own, *self.given)
         return list({word.lstrip("+").partition("=")[0]: word for word in words}.values())
 
+    def value(self, key: str) -> str:
+        """Return the value of a key; empty where no word has it."""
+        values = (word.lstrip("+").partition("=") for word in self.all)
+        return next((value for name, _, value in values if name == key), "")
+
     def compose(self) -> Conf:
         """Return the config.
 
@@ -124,17 +130,20 @@ def train(settings: Settings) -> None:
         found = _look(words)
         if found is None:
             return
-        recipe = settings.recipe or found.mixture.recipe
-        words.own += _recipe(recipe)
+        words.own += _recipe(settings.recipe or found.mixture.recipe)
         if settings.minutes and unit:
             left = 60 * settings.minutes - (time.monotonic() - begin)
             _choose_steps(found, words, settings, unit, left)
         conf = words.compose()
-        _say(
-            f"training by {recipe}: {conf.train.steps:,} steps at {conf.variant.long_side} px,"
-            f" {format_duration(_expected_s(found, conf, unit))}"
-        )
-    sweep.run("xrgs-train", [*words.all, "hydra.sweeper.brief=true"])
+        recipe = words.value("ablation") or BASELINE
+        what = f"{recipe}: {conf.train.steps:,} steps at {conf.variant.long_side} px"
+        if _cell(found, conf).state(verify=False).name == "done":
+            _say(f"trained already by {what}")
+        else:
+            _say(f"training by {what}, {format_duration(_expected_s(found, conf, unit))}")
+    again = "the command above continues" if settings.minutes else "run it again to continue"
+    hint = f"What is done is kept: {again}."
+    sweep.run("xrgs-train", [*words.all, "hydra.sweeper.brief=true"], hint)
     _say_end(found, conf, settings, time.monotonic() - begin)
 
 
@@ -188,10 +197,9 @@ def _look(words: _Words) -> _Found | None:
     report = JoinedStore((store,)).variant_report(planned.id)
     found = mixture(read_views(store.variants, planned.id))
     _say(f"{name}: the cameras of {report.registered} of {report.images} {kind}s are found")
-    kinds = "a mixture" if found.is_one else "alike"
     _say(
-        f"{name}: {kinds}: {found.coarse} of {found.views} {kind}s show the scene at two thirds of"
-        f" the finest ones' resolution or less"
+        f"{name}: {'a mixture' if found.is_one else 'photographs alike'}: {found.coarse} of"
+        f" {found.views} to train on are 1.5 times or more as coarse as the finest"
     )
     return None if conf.dry_run else _Found(planned.id, found, report)
 
@@ -250,12 +258,11 @@ def _units_of_a_step(found: _Found, conf: Conf) -> float:
 
 def _say_end(found: _Found, conf: Conf, settings: Settings, seconds: float) -> None:
     """Say in at most eight lines what was made, where it is, and what comes next."""
-    from xrgs.experiment.identity import cell_id, cell_identity
     from xrgs.report.page import PAGE
     from xrgs.sweep.ending import next_commands
 
     store, name = Store(conf.store), scenes.label(conf.scene)
-    cell = store.cell(cell_id(cell_identity(conf, found.variant_id)))
+    cell = _cell(found, conf)
     summary, report = cell.summary(), found.report
     scores = [values["psnr"] for _, values in cell.view_scores()]
     unseen = "that it had not seen" if report.tests else "that it was trained on"
@@ -270,11 +277,19 @@ def _say_end(found: _Found, conf: Conf, settings: Settings, seconds: float) -> N
     except StoreError:  # several cells of the scene are done
         word = cell.id[:8]
     say("Next:")
-    commands = next_commands([word], name, store.path)
+    # Not the name of the video itself, which a film would replace.
+    file = f"{Path(name).stem}-scene" if conf.scene.kind == "video" else name
+    commands = next_commands([word], file, store.path)
     if settings.out is not None:
         commands[-1] = f"written: {write_export(cell.path, settings.out)}"
     for command in commands:
         say(f"  {command}")
+
+
+def _cell(found: _Found, conf: Conf) -> CellFolder:
+    from xrgs.experiment.identity import cell_id, cell_identity
+
+    return Store(conf.store).cell(cell_id(cell_identity(conf, found.variant_id)))
 
 
 def _kind(conf: Conf) -> str:

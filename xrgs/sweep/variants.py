@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from xrgs.capture import photographs, scenes, split, variant
-from xrgs.capture.degradations import resolve_degradation
+from xrgs.capture.degradations import DEGRADATIONS, resolve_degradation
 from xrgs.capture.description import read_report
 from xrgs.capture.folders import failed_folder, trimmed_folder
 from xrgs.config import CONF_DIR
@@ -28,7 +28,7 @@ from xrgs.sweep.jobs.supervise import Limits
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from xrgs.config import Conf, SceneConf
+    from xrgs.config import Conf, SceneConf, VariantConf
     from xrgs.experiment.store import Store
 
 _Result = TypeVar("_Result")
@@ -340,7 +340,20 @@ def _expected_notes(conf: Conf, store: Store) -> tuple[str, ...]:
         notes = [*scene.notes, *photos.notes]
     _check_held_out(names, conf, notes)
     parts = split.split_before_sfm(names, sizes, conf.variant)
+    if conf.scene.kind == "folder":
+        notes.append(_what_becomes_of_them(parts, conf.variant))
     return *notes, *split.split_notes(parts, conf.variant)
+
+
+def _what_becomes_of_them(parts: split.Split, conf: VariantConf) -> str:
+    """Say how many photographs are held out, trained on, and degraded."""
+    trained, tests, way = len(parts.hr) + len(parts.lr), len(parts.test), resolve_degradation(conf)
+    said = f"{counted(trained + tests, 'photograph')}: {tests} held out, {trained} to train on"
+    if way == "none" or not parts.lr:
+        return f"{said}, as they are"
+    smaller = way in DEGRADATIONS and DEGRADATIONS[way].smaller
+    made = f"made {conf.factor} times smaller" if smaller else f"degraded by {way}"
+    return f"{said}, {len(parts.lr)} of which are {made}; variant.hr_fraction=1 leaves them as they are"
 
 
 def _check_held_out(names: Sequence[str], conf: Conf, notes: Iterable[str] = ()) -> None:

@@ -121,7 +121,7 @@ def _with(model: Model, antialiased: bool | None) -> Model:
 
 def _load(word: str, store: Store) -> Model:
     file = user_path(word)
-    if file.suffix.lower() in READERS or file.is_file():
+    if file.suffix.lower() in READERS:
         gaussians, antialiased = load_gaussians(file)
         settings = RasterSettings(antialiased=antialiased)
         return Model(for_line(file.name, _MAX_NAME), gaussians, settings)
