@@ -353,7 +353,8 @@ def _what_becomes_of_them(parts: split.Split, conf: VariantConf) -> str:
         return f"{said}, as they are"
     smaller = way in DEGRADATIONS and DEGRADATIONS[way].smaller
     made = f"made {conf.factor} times smaller" if smaller else f"degraded by {way}"
-    return f"{said}, {len(parts.lr)} of which are {made}; variant.hr_fraction=1 leaves them as they are"
+    lr = f"{len(parts.lr)} of which are {made}"
+    return f"{said}, {lr}; variant.hr_fraction=1 leaves them as they are"
 
 
 def _check_held_out(names: Sequence[str], conf: Conf, notes: Iterable[str] = ()) -> None:
