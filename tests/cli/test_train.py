@@ -68,7 +68,10 @@ def test_the_recipe_is_for_what_the_photographs_are(
         (["--recipe", "lean"], {"ablation": "lean"}),
         (["--recipe", "plus,exposure"], {"ablation": "[plus,exposure]"}),
         (["--quality", "high"], {"preset": "paper", "train.evaluate_every": "0"}),
+        ([], {"preset": "laptop", "splat.densify.every": "500"}),  # as preset=laptop has it
         (["--quality=draft"], {"train.steps": "1000", "variant.long_side": "336"}),
+        (["train.steps=100"], {"splat.densify.every": "15000"}),
+        (["train.steps=100", "splat.densify.every=7"], {"splat.densify.every": "7"}),
         (["--size", "250"], {"variant.long_side": "250"}),
         (["size=250", "--quality", "draft"], {"variant.long_side": "250", "train.steps": "1000"}),
         (["--all"], {"variant.test_every": "0"}),
@@ -87,6 +90,14 @@ def test_options_are_overrides_and_those_of_the_user_win(
 ) -> None:
     words = handed_over(Mixture(0, 8), "garden", *arguments)
     assert expected.items() <= words.items()
+
+
+@pytest.mark.usefixtures("garden")
+def test_a_long_run_is_refined_as_the_paper_s(
+    handed_over: Callable[..., dict[str, str]],
+) -> None:
+    words = handed_over(Mixture(0, 8), "garden", "--quality", "high")
+    assert "splat.densify.every" not in words
 
 
 @pytest.mark.usefixtures("garden")

@@ -41,11 +41,11 @@ _INTERPOLATED = re.compile(r"\$\{([^:}]*)")
 #: Options of Hydra; those of the second set have a value.
 _HYDRA_OPTIONS = frozenset(
     {"-h", "--help", "--hydra-help", "--version", "--resolve", "--run", "-r", "--multirun", "-m"}
-    | {"--shell-completion", "-sc", "--info", "-i"}
+    | {"--shell-completion", "-sc"}
 )
 _HYDRA_VALUES = frozenset(
     {"--cfg", "-c", "--package", "-p", "--config-path", "-cp", "--config-name", "-cn"}
-    | {"--config-dir", "-cd", "--experimental-rerun"}
+    | {"--config-dir", "-cd", "--experimental-rerun", "--info", "-i"}
 )
 #: Keys that are switched on by `true`.
 _FLAGS = frozenset({"dry_run", "fail_fast"})

@@ -29,6 +29,7 @@ from xrgs.runtime.signals import exit_on_signal
 from xrgs.runtime.streams import say
 from xrgs.runtime.text import format_duration
 from xrgs.safeio.sanitize import counted, for_line
+from xrgs.splat.settings import NOMINAL_STEPS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -43,8 +44,9 @@ _QUALITIES = {
     "normal": ("preset=laptop",),
     "high": ("preset=paper", "train.evaluate_every=0"),
 }
-#: Steps from which on a run has the settings of `preset=paper`, and not those of a short one.
-_LONG_RUN = 10_000
+#: Steps from which on a run has the settings of `preset=paper`; and the steps of a shorter run
+#: between two refinements, those of `preset=laptop`: with fewer, more grows than it can train.
+_LONG_RUN, _REFINED_EVERY = 10_000, 50
 #: How the notes on photographs begin that are for studies.
 _FOR_STUDIES = ("the split by variant.tags=", "sampling rates of training views differ by")
 
@@ -134,6 +136,9 @@ def train(settings: Settings) -> None:
         if settings.minutes and unit:
             left = 60 * settings.minutes - (time.monotonic() - begin)
             _choose_steps(found, words, settings, unit, left)
+        steps = words.compose().train.steps
+        if steps < _LONG_RUN:
+            words.own.append(f"splat.densify.every={_REFINED_EVERY * NOMINAL_STEPS // steps}")
         conf = words.compose()
         recipe = words.value("ablation") or BASELINE
         what = f"{recipe}: {conf.train.steps:,} steps at {conf.variant.long_side} px"
@@ -281,7 +286,7 @@ def _say_end(found: _Found, conf: Conf, settings: Settings, seconds: float) -> N
     file = f"{Path(name).stem}-scene" if conf.scene.kind == "video" else name
     commands = next_commands([word], file, store.path)
     if settings.out is not None:
-        commands[-1] = f"written: {write_export(cell.path, settings.out)}"
+        commands[-1] = write_export(cell.path, settings.out)
     for command in commands:
         say(f"  {command}")
 
