@@ -46,8 +46,8 @@ def test_a_sweep_trains_each_cell_once_and_ends_with_the_table(
     assert out.startswith("the table\n\n4 done cells\n")
     assert len(children.trained) == len(set(children.trained)) == 4
     assert all(cell_id in out for cell_id in children.trained)
-    first, last = (re.escape(children.trained[n][:8]) for n in (2, 3))
-    assert re.search(rf"^  xrgs-view {first} {last} --store s$", out, re.MULTILINE)
+    first, last = (str(row.cell_id)[:8] for row in Store(tmp_path / "s").sweep_record().cells[2:])
+    assert f"\n  xrgs-view {first} {last} --store s\n" in out  # a cell and its baseline
     assert f"xrgs-data export {last} --out consistency.ply --store s" in out
     assert out.count("xrgs-view") == 1
     code, out, err = sweep_here(*arguments)
@@ -399,6 +399,7 @@ def test_a_data_root_a_level_off_is_answered_with_the_right_one(
     code, _, err = sweep_here("scene=llff/fern", f"data_root={given}", "dry_run=true")
     assert code == 1
     assert "data/llff/fern is there: data_root=data/llff\n" in err
+    assert "download" not in err
 
 
 def test_captures_are_looked_for_in_data_root(sweep_here: SweepHere, tmp_path: Path) -> None:

@@ -118,6 +118,9 @@ def how_to_get(scenes: Iterable[SceneConf]) -> str:
         path = Path(scene.path or "")
         if path.name == scene.name and not path.exists():
             absent[scene.name] = path
+    near = {name: found for name, path in absent.items() if (found := _root_near(path))}
+    hints = [f"{root}/{name} is there: data_root={root}" for name, root in near.items()]
+    absent = {name: path for name, path in absent.items() if name not in near}
     missing: dict[tuple[str, Path], list[str]] = {}
     for file in sorted((CONF_DIR / "data").glob("*.yaml")):
         published = OmegaConf.load(file).scenes
@@ -130,11 +133,6 @@ def how_to_get(scenes: Iterable[SceneConf]) -> str:
         + ("" if root == usual else f" --data-root {shlex.quote(str(root))}")
         for (dataset, root), names in missing.items()
     ]
-    hints = [
-        f"{root}/{name} is there: data_root={root}"
-        for name, path in absent.items()
-        for root in _roots_near(path)
-    ]
     hints += [f"to download what is missing: {'; '.join(commands)}"] if commands else []
     captures = {file.stem for file in (CONF_DIR / "scene/captures").glob("*.yaml")}
     if own := [str(path) for name, path in absent.items() if name in captures]:
@@ -145,12 +143,12 @@ def how_to_get(scenes: Iterable[SceneConf]) -> str:
     return "\n".join(hints)
 
 
-def _roots_near(missing: Path) -> list[str]:
-    """Return the folders beside a wrong `data_root` that have a scene: one below, or one above."""
+def _root_near(missing: Path) -> str:
+    """Return the right `data_root` beside a wrong one, a level below or above; else an empty text."""
     root, name = missing.parent, missing.name
-    below = sorted(folder.parent for folder in root.glob(f"*/{name}") if folder.is_dir())
-    above = [root.parent] if root.name == name and root.is_dir() else []
-    return [shlex.quote(str(found)) for found in (*below, *above)]
+    found = [folder.parent for folder in sorted(root.glob(f"*/{name}")) if folder.is_dir()]
+    found += [root.parent] if root.name == name and root.is_dir() else []
+    return shlex.quote(str(found[0])) if found else ""
 
 
 def find_or_build(conf: Conf, store: Store) -> str:
