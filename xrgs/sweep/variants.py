@@ -144,7 +144,7 @@ def how_to_get(scenes: Iterable[SceneConf]) -> str:
 
 
 def _root_near(missing: Path) -> str:
-    """Return the right `data_root`, a level below or above a wrong one; empty where there is none."""
+    """Return the right `data_root`, a level below or above a wrong one; empty if there is none."""
     root, name = missing.parent, missing.name
     found = [folder.parent for folder in sorted(root.glob(f"*/{name}")) if folder.is_dir()]
     found += [root.parent] if root.name == name and root.is_dir() else []
