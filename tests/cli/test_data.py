@@ -69,12 +69,14 @@ def test_inspect_takes_a_folder_of_photographs_as_they_are(
     monkeypatch.setattr(worker, "run_in_child", build)
     monkeypatch.setattr(variant, "find", lambda *_: None)
     monkeypatch.setattr(xrgs.capture.description, "describe", lambda folder, out: f"{folder} {out}")
-    code, out, err = xrgs_data("inspect", "garden", "variant.long_side=99", "store=s")
+    code, out, err = xrgs_data(
+        "inspect", "garden", "variant.long_side=99", "variant=distance", "store=s"
+    )
     assert code == 0, err
     assert out.endswith("s/variants/k-1 None\n")
     (conf,) = asked
     assert (conf["scene"]["path"], conf["variant"]["long_side"]) == ("garden", 99)
-    assert (conf["variant"]["tags"], conf["variant"]["degradation"]) == ("sampling_rate", "auto")
+    assert (conf["variant"]["tags"], conf["variant"]["factor"]) == ("distance", 1)
     code, _, err = xrgs_data("inspect", "graden")
     assert code == 1
     assert err == "xrgs-data: graden: there is no such folder, and no store xrgs-store"

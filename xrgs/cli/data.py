@@ -15,7 +15,7 @@ from xrgs.capture.frozen import MANIFEST
 from xrgs.capture.scenes.scene import ALL_BELOW
 from xrgs.cli import options
 from xrgs.cli.options import STORE, Folder, Names, OptionalFolder, shown_as
-from xrgs.cli.photographs import as_they_are
+from xrgs.cli.photographs import as_they_are, last_of_each_key
 from xrgs.errors import XrgsError
 from xrgs.experiment.cell_folder import IDENTITY, CellFolder
 from xrgs.experiment.export import SPLAT_FORMATS
@@ -118,7 +118,7 @@ def _variant(words: Sequence[str]) -> Path:
     if is_failed(path.name) or (path / MANIFEST).is_file():
         return path
     if path.exists() and not (path / IDENTITY).is_file():
-        words = [*as_they_are(first), *others]
+        words = last_of_each_key([*as_they_are(first), *others])
     elif "=" not in first:
         store = Store(next((w[6:] for w in others if w.startswith("store=")), STORE))
         if not path.exists() and not store.exists:

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from xrgs.capture.images import SUFFIXES
 from xrgs.capture.scenes.scene import ALL_BELOW
 from xrgs.errors import XrgsError
 from xrgs.safeio.paths import user_path
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
 
 
 def as_they_are(given: str) -> list[str]:
@@ -28,3 +33,8 @@ def as_they_are(given: str) -> list[str]:
     # Nothing is cropped, and two photographs to train on are enough.
     variant = ("variant=sampling_rate", "variant.factor=1", "variant.min_hr=1")
     return [f"scene={kind}", f"scene.path={given}", *variant]
+
+
+def last_of_each_key(words: Iterable[str]) -> list[str]:
+    """Return overrides without those whose key a later one has, which Hydra refuses for groups."""
+    return list({word.lstrip("+").partition("=")[0]: word for word in words}.values())

@@ -21,7 +21,7 @@ from xrgs.cli import budget, options, sweep
 from xrgs.cli.data import form_of, write_export
 from xrgs.cli.hydra_words import check_no_axis, explained, with_quotes
 from xrgs.cli.options import STORE, Flag, Folder, OptionalFolder, shown_as
-from xrgs.cli.photographs import as_they_are
+from xrgs.cli.photographs import as_they_are, last_of_each_key
 from xrgs.errors import StoreError, XrgsError
 from xrgs.experiment.store import BASELINE, Store
 from xrgs.runtime.machine import set_passive_openmp_wait, usable_cores
@@ -90,8 +90,7 @@ class _Words:
     @property
     def all(self) -> list[str]:
         """All of them."""
-        words = (*self.own, *self.given)
-        return list({word.lstrip("+").partition("=")[0]: word for word in words}.values())
+        return last_of_each_key([*self.own, *self.given])
 
     def value(self, key: str) -> str:
         """Return the value of a key; empty where no word has it."""
