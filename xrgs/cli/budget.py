@@ -38,5 +38,5 @@ def steps_for(seconds: float, of_a_step: float) -> int:
         of_a_step: Seconds of a step.
     """
     count = int((_OF_THE_REST * seconds - _ENDING_S) / of_a_step)
-    digits = 10 ** max(0, len(str(max(count, 0))) - 2)
+    digits: int = 10 ** max(0, len(str(max(count, 0))) - 2)
     return min(_MOST, max(_LEAST, count // digits * digits))
