@@ -28,7 +28,7 @@ def test_a_sweep_ends_with_the_table_and_where_it_is(swept: tuple[Path, str]) ->
     assert "n/a" in out
     assert "one replicate: no interval" in out
     assert "↑" in out or "↓" in out
-    written = folder / re.search(r"^Page: (.*)/report\.html$", out, re.MULTILINE)[1]
+    (written,) = map(folder.joinpath, re.findall(r"^Page: (.*)/report\.html$", out, re.MULTILINE))
     assert {"table.md", "table.tex", "table.csv"} <= {file.name for file in written.iterdir()}
 
 

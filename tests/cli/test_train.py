@@ -138,6 +138,7 @@ def test_more_time_gives_larger_views_and_more_steps_and_never_exceeds_the_time(
     [
         (["gone"], "gone: there is no such folder or video"),
         (["garden/0.png"], "garden/0.png: is a photograph; name the folder that it is in"),
+        (["a.zip"], "a.zip: is neither a folder of photographs nor a video"),
         (["garden", "seed=0,1"], "seed=0,1: give one value; xrgs-sweep takes several"),
         (["garden", "steps=5"], "steps: there is no such key; did you mean train.steps"),
         (["garden", "--minutes", "0"], "--minutes 0: must be above 0"),
@@ -156,6 +157,7 @@ def test_what_cant_be_done_is_said_before_anything_is(
     arguments: list[str],
     message: str,
 ) -> None:
+    (tmp_path / "a.zip").touch()
     photographs(tmp_path / "two", 2)
     photographs(tmp_path / "one", 1)
     code, _, err = call_command("train", *arguments)

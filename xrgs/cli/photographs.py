@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from xrgs.capture.images import SUFFIXES
+from xrgs.capture.scenes.folder import VIDEOS
 from xrgs.capture.scenes.scene import ALL_BELOW
 from xrgs.errors import XrgsError
 from xrgs.safeio.paths import user_path
@@ -30,6 +31,8 @@ def as_they_are(given: str) -> list[str]:
     if not path.exists():
         raise XrgsError(f"{given}: there is no such folder or video")
     kind = "folder" if path.is_dir() else "video"
+    if kind == "video" and path.suffix.lower() not in VIDEOS:
+        raise XrgsError(f"{given}: is neither a folder of photographs nor a video")
     # Nothing is cropped, and two photographs to train on are enough.
     variant = ("variant=sampling_rate", "variant.factor=1", "variant.min_hr=1")
     return [f"scene={kind}", f"scene.path={given}", *variant]
