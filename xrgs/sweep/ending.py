@@ -36,7 +36,9 @@ def ending(plan: Sequence[PlannedCell], store: Path) -> str:
     notes = (f"and {more} more: xrgs-status lists them",) if more > 0 else ()
     table = TextTable(counted(len(done), "done cell"), ("cell", "name"), rows, "ll", notes)
     last = done[-1]
-    first = next(cell for cell in done if cell.spec.shared == last.spec.shared)  # its baseline
+    # Its baseline, where the two share a variant: no camera shows the same in two variants.
+    alike = (last.spec.shared, last.variant_id)
+    first = next(cell for cell in done if (cell.spec.shared, cell.variant_id) == alike)
     shown = list(dict.fromkeys(str(cell.cell_id)[:_ID] for cell in (first, last)))
     commands = next_commands(shown, last.spec.label, store)
     return "\n".join([to_text(table), "Next:", *(f"  {line}" for line in commands)])
