@@ -210,7 +210,7 @@ def test_a_scene_is_made_and_its_last_lines_lead_on(
     code, out, err = forked_command("train", tmp_path, "my bike", "--all", *small, "--out=a.ply")
     assert code == 0, err  # found again, and exported by its name
     assert "training" not in err + out
-    assert "trained already by keep_large: 8 steps at 250 px\n" in out
+    assert f"trained already by {ALIKE_RECIPE}: 8 steps at 250 px\n" in out
     assert out.splitlines()[-1].endswith("written to a.ply")
     assert forked_command("data", tmp_path, "export", "my bike", "--out", "b.ply")[0] == 0
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
