@@ -13,7 +13,7 @@ import sys
 from contextlib import contextmanager
 from dataclasses import is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeAlias, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, get_type_hints
 
 import tyro
 from tyro.conf import CascadeSubcommandArgs, DisallowNone, FlagCreatePairsOff, OmitArgPrefixes, arg
@@ -97,9 +97,9 @@ def _unwrapped(function: Callable[..., None]) -> Callable[..., None]:
     return function
 
 
-def _names(function: Callable[..., None]) -> Iterator[str]:
-    """Yield the names of a function's options, those of its dataclasses among them."""
-    for name, hint in get_type_hints(function, include_extras=True).items():
+def _names(options: Any) -> Iterator[str]:
+    """Yield the names of the options of a function or a dataclass, with those of its dataclasses."""
+    for name, hint in get_type_hints(options, include_extras=True).items():
         if is_dataclass(hint):
             yield from _names(hint)
         given = (getattr(mark, "name", None) for mark in getattr(hint, "__metadata__", ()))
