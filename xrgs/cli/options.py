@@ -98,7 +98,7 @@ def _unwrapped(function: Callable[..., None]) -> Callable[..., None]:
 
 
 def _names(options: Any) -> Iterator[str]:
-    """Yield the names of the options of a function or a dataclass, with those of its dataclasses."""
+    """Yield the names of a function's options, or of a dataclass, with those of its dataclasses."""
     for name, hint in get_type_hints(options, include_extras=True).items():
         if is_dataclass(hint):
             yield from _names(hint)
