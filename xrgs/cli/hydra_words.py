@@ -7,7 +7,7 @@ import shlex
 from contextlib import contextmanager, suppress
 from dataclasses import is_dataclass
 from itertools import accumulate, pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Quote, QuotedString
@@ -161,7 +161,7 @@ def _is_whole_number(key: str) -> bool:
     """Return whether a key of the schema is a whole number."""
     kind: Any = config.Conf
     for name in key.split("."):
-        kind = config.types_of(kind).get(name) if is_dataclass(kind) else None
+        kind = config.types_of(cast("Any", kind)).get(name) if is_dataclass(kind) else None
     return kind is int
 
 
