@@ -27,6 +27,8 @@ class XrgsSweeperConf:
     _target_: str = "hydra_plugins.xrgs_sweeper.XrgsSweeper"
     params: dict[str, str] | None = None
     """Axes that a file of `sweeps/` sets: comma-separated values by the override's key."""
+    brief: bool = False
+    """Print only progress and failures: `xrgs-train` says the rest."""
 
 
 #: `conf/config.yaml` is checked against it.
@@ -66,8 +68,9 @@ class XrgsSearchPath(SearchPathPlugin):
 class XrgsSweeper(Sweeper):
     """Plans the cells of a study and launches those that are not done."""
 
-    def __init__(self, params: dict[str, str] | None) -> None:
+    def __init__(self, params: dict[str, str] | None, brief: bool) -> None:
         self._params = params or {}
+        self._brief = brief
 
     def setup(
         self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
@@ -92,4 +95,5 @@ class XrgsSweeper(Sweeper):
         from xrgs.sweep.study import Study
 
         axes = [f"{key}={values}" for key, values in self._params.items()]
-        return Study(self._context, self._task, self._config).run([*axes, *arguments])
+        study = Study(self._context, self._task, self._config, brief=self._brief)
+        return study.run([*axes, *arguments])

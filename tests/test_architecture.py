@@ -66,6 +66,7 @@ LIGHT = (
     "cli.status",
     "cli.store",
     "cli.sweep",
+    "cli.train",
     "cli.view",
     "report",
     "sweep.cleaning",

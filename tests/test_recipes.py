@@ -1,7 +1,7 @@
 """Follows each recipe of docs/add_*.md to the letter, in a copy of the package.
 
-A comment before a block of the document says where the block goes. The copy comes first on the path
-of the commands that are then run as a contributor would run them.
+The sentence before a block of the document says where the block goes, in words that readers see.
+The copy comes first on the path of the commands that are then run as a contributor would run them.
 """
 
 from __future__ import annotations
@@ -23,9 +23,13 @@ from xrgs.config import CONF_DIR
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[1]
-#: Comment and block: recipe, what to do with the block, and its text.
-BLOCK = re.compile(r"<!-- recipe: (\w+), (.*?) -->\n```\w+\n(.*?)```", re.DOTALL)
-NEW, EDIT = re.compile(r"new file (\S+)"), re.compile(r"in (\S+) (before|after) (.*)", re.DOTALL)
+#: Sentence and block: the new file, or the file and the line before or after which the block goes
+#: (before the decorator or the comment of the line, where it says so), and the block's text.
+BLOCK = re.compile(
+    r"(?:new file `([^`]+)`|in `([^`]+)`\s+(before|after) `([^`]+)`( and its \w+)?):\n\n"
+    r"```\w+\n(.*?)```",
+    re.DOTALL,
+)
 SMOKE = ("scene=motorcycle", "preset=smoke", "threads=1", "store=s")
 
 
@@ -38,22 +42,23 @@ class Copy:
     def follow(self, recipe: str) -> None:
         """Put every block of a recipe where its comment says."""
         text = (ROOT / "docs" / f"add_{recipe}.md").read_text(encoding="utf-8")
-        blocks = [(where, block) for name, where, block in BLOCK.findall(text) if name == recipe]
-        assert blocks, recipe
-        for where, block in blocks:
-            if new := NEW.fullmatch(where):
-                file = self.root / new[1]
+        blocks = BLOCK.findall(re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL))
+        # All blocks of code but those of a shell go somewhere; of add_scene, one is an example.
+        total = len(re.findall(r"^```(?!sh)\w+$", text, re.MULTILINE)) - (recipe == "scene")
+        assert len(blocks) == total
+        for new, name, side, anchor, with_head, block in blocks:
+            file = self.root / (new or name)
+            if new:
                 assert not file.exists()
                 file.write_text(block)
                 continue
-            edit = EDIT.fullmatch(where)
-            assert edit, where
-            name, side, anchor = edit.groups()
-            anchor = anchor.replace("\\n", "\n")
-            file, content = self.root / name, (self.root / name).read_text()
-            assert content.count(anchor) == 1, (name, anchor, content.count(anchor))
-            around = f"{block}{anchor}" if side == "before" else f"{anchor}\n{block.rstrip()}"
-            file.write_text(content.replace(anchor, around))
+            lines = file.read_text().splitlines(keepends=True)
+            (at,) = (n for n, line in enumerate(lines) if line.strip().startswith(anchor))
+            at += side == "after"
+            while with_head and lines[at - 1].strip().startswith(("#", "@")):
+                at -= 1
+            lines[at:at] = block.splitlines(keepends=True)
+            file.write_text("".join(lines))
 
     def edit(self, name: str, old: str, new: str) -> None:
         """Replace a text of a file of the package."""
@@ -116,7 +121,10 @@ def test_a_component(copy: Copy) -> None:
     assert "2 cells, 2 done" in done_cells(copy)  # what is off is in no id
     printed = copy.run("sweep", "components.fade.weight=0.1", *SMOKE)
     assert "fade.weight=0.1 against baseline" in printed
-    assert "components.fade.weight" in copy.run("sweep", "help=components.fade")
+    explained = copy.run("sweep", "help=components.fade")
+    assert "of the mean opacity in the loss; 0 is off" in explained
+    assert "plugin" not in explained
+    assert "entry points" in copy.run("sweep", "help=components.plugins")
 
 
 def test_a_metric_is_added_rescored_and_in_the_table(copy: Copy) -> None:
@@ -223,4 +231,4 @@ def test_a_launcher(copy: Copy) -> None:
     )
     printed = copy.run("sweep", *SMOKE[:2], "store=s", "train.steps=2", "hydra/launcher=pool")
     assert "hydra/launcher=pool: 1 cell, threads=" in printed
-    assert "Written to" in printed
+    assert "Page: s/reports/" in printed

@@ -53,6 +53,35 @@ def test_inspect_builds_a_variant_that_the_store_lacks(
     assert jobs == ([] if built else [("variant", "motorcycle")])
 
 
+def test_inspect_takes_a_folder_of_photographs_as_they_are(
+    xrgs_data: XrgsData,
+    photographs: Callable[..., Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked = []
+
+    def build(_: str, request: dict[str, Any], *__: object) -> dict[str, Any]:
+        asked.append(request["conf"])
+        return {"variant": "k-1"}
+
+    photographs(tmp_path / "garden", 4)
+    monkeypatch.setattr(worker, "run_in_child", build)
+    monkeypatch.setattr(variant, "find", lambda *_: None)
+    monkeypatch.setattr(xrgs.capture.description, "describe", lambda folder, out: f"{folder} {out}")
+    code, out, err = xrgs_data(
+        "inspect", "garden", "variant.long_side=99", "variant=distance", "store=s"
+    )
+    assert code == 0, err
+    assert out.endswith("s/variants/k-1 None\n")
+    (conf,) = asked
+    assert (conf["scene"]["path"], conf["variant"]["long_side"]) == ("garden", 99)
+    assert (conf["variant"]["tags"], conf["variant"]["factor"]) == ("distance", 1)
+    code, _, err = xrgs_data("inspect", "graden")
+    assert code == 1
+    assert err == "xrgs-data: graden: there is no such folder, and no store xrgs-store"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("layout", ["colmap", "nerfstudio"])
 def test_exported_splats_cameras_and_points_are_in_one_frame(
@@ -183,16 +212,23 @@ def test_files_of_gaussians_are_converted(xrgs_data: XrgsData, tmp_path: Path) -
     points = torch.rand(9, 3, generator=torch.Generator().manual_seed(0))
     gaussians = xrgs.Gaussians.from_points(points, points)
     xrgs.save_ply(tmp_path / "a.b.ply", gaussians, antialiased=True)
-    for source, form, made in (("a.b.ply", "glb", "a.b.glb"), ("./a.b.glb", "spz", "a.b.spz")):
-        code, said, err = xrgs_data("export", source, "--format", form)
-        assert code == 0, err
-        assert said == f"9 antialiased Gaussians: written to {made}\n"
+    for _ in range(2):  # a file is replaced
+        for source, form, made in (("a.b.ply", "glb", "a.b.glb"), ("./a.b.glb", "spz", "a.b.spz")):
+            code, said, err = xrgs_data("export", source, "--format", form)
+            assert code == 0, err
+            assert said == f"9 antialiased Gaussians: written to {made}\n"
+    for made in ("c.ply", "C.GLB", "d.spz"):  # the end of the name is the format
+        code, said, err = xrgs_data("export", "a.b.ply", "--out", made)
+        assert (code, said) == (0, f"9 antialiased Gaussians: written to {made}\n"), err
+        assert len(xrgs.load_gaussians(tmp_path / made).gaussians) == 9
     read = xrgs.load_gaussians(tmp_path / "a.b.spz")
     assert read.antialiased
     assert torch.allclose(read.gaussians.means, gaussians.means, atol=1e-6)
     for arguments, message in (
-        (["a.b.ply", "--format", "glb"], "--out a.b.glb: it exists; name a new file"),
         (["a.b.ply", "--format", "glb", "--out", "x"], "must end with .glb"),
+        (["a.b.ply", "--format", "glb", "--out", "."], "--out .: "),
+        (["a.b.ply", "--out", "x.obj"], "--out x.obj: a file ends with .ply, .glb, .spz"),
+        (["a.b.ply", "--out", "x.ply", "--format", "colmap"], "--out x.ply: --format colmap"),
         (["a.b.ply", "--format", "glb", "--out", "no/x.glb"], "--out no/x.glb: No such file"),
         (["none.ply", "--format", "glb"], "none.ply: cannot be read"),
         (["a.b.ply"], "a.b.ply: Not a directory; give the folder"),
@@ -208,7 +244,7 @@ def test_what_cant_be_exported_is_named(xrgs_data: XrgsData, tmp_path: Path) -> 
     for arguments, message in (
         (["gone"], "--store xrgs-store is not a store"),
         (["gone", "--store", "s"], "gone: no cells or variants have such an id"),
-        (["c", "--store", "s"], "c: several cells or variants have such an id: c1-ab, cd"),
+        (["c", "--store", "s"], "c: several cells or variants have such an id or scene: c1-ab, cd"),
         (["./gone"], "gone: No such file or directory; give the folder"),
         (["empty"], "empty: neither a cell nor a variant"),
     ):

@@ -178,15 +178,54 @@ def test_an_error_of_hydra_is_one_line_with_a_hint(kind: type[Exception]) -> Non
         (["hydra/launcher=jobli"], "hydra/launcher=jobli: there is no such choice"),
         (["dry_run=maybe"], "dry_run: Value 'maybe' is not a valid bool"),
         (["seed=["], "seed=[: "),
+        (["garden"], "garden: to train on these photographs, type: xrgs-train garden"),
+        (["plus"], "plus: an ablation is given as +ablation=plus"),
+        (["fern"], "fern: a scene is given as scene=llff/fern"),
+        (["nothing"], "nothing: write KEY=VALUE"),
+        (["--seed", "3"], "--seed: there is no such option; write seed=3"),
+        (["--store=s"], "--store=s: there is no such option; write store=s"),
+        (["--fail-fast"], "--fail-fast: there is no such option; write fail_fast=true"),
+        (["--scene", "garden"], "--scene: there is no such option; write scene=garden"),
+        (["--minutes", "3"], "--minutes: there is no such option; see xrgs-sweep --help"),
+        (["+ablation=a,", "b"], "write it without the space: +ablation=a,b"),
+        (["seed=0", ",1"], "write it without the space: seed=0,1"),
+        (["+ablation=[a,", "b]"], "write it without the space: '+ablation=[a,b]'"),
+        (["+ablation=qqqq"], "there is no such choice; xrgs-sweep --help lists all "),
     ],
     ids=lambda value: value[0] if isinstance(value, list) else "",
 )
 def test_a_typo_is_one_line_with_what_was_meant(
-    sweep_here: RunCommand, words: list[str], message: str
+    sweep_here: RunCommand, tmp_path: Path, words: list[str], message: str
 ) -> None:
+    (tmp_path / "garden").mkdir()
     code, out, err = sweep_here(*words, *[] if "dry_run" in words[0] else ["dry_run=true"])
     assert (code, out) == (1, "")
     assert err.startswith("xrgs-sweep: ")
     assert message in err
     assert "HYDRA_FULL_ERROR" not in err
     assert len(err.splitlines()) == 1
+
+
+def test_a_sweep_with_nothing_says_what_to_type(sweep_here: RunCommand, tmp_path: Path) -> None:
+    code, out, err = sweep_here()
+    assert (code, out) == (2, "")
+    assert "xrgs-train FOLDER" in err
+    assert "xrgs-sweep +ablation=consistency" in err
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("word", "read"),
+    [
+        ("train.steps=3e3", "train.steps=3000"),
+        ("train.steps=1e2,2.0,5", "train.steps=100,2,5"),
+        ("seed=1E1", "seed=10"),
+        ("variant.long_side=504.0", "variant.long_side=504"),
+        ("train.steps=1.5", "train.steps=1.5"),  # refused by its type
+        ("train.steps=range(0,9)", "train.steps=range(0,9)"),
+        ("train.validation=3e-1", "train.validation=3e-1"),  # no whole number
+        ("scene.path=1e3", "scene.path='1e3'"),
+    ],
+)
+def test_a_whole_number_may_be_written_in_any_way(word: str, read: str) -> None:
+    assert with_quotes([word]) == [read]

@@ -18,7 +18,7 @@ from xrgs.errors import XrgsError
 from xrgs.viewer.paths import PATHS
 
 RunCommand = Callable[..., tuple[int, str, str]]
-COMMANDS = ("bench", "data", "render", "report", "status", "store", "view")
+COMMANDS = ("bench", "data", "render", "report", "status", "store", "train", "view")
 
 
 @pytest.mark.slow

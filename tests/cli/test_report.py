@@ -93,4 +93,7 @@ def test_a_sweep_that_is_not_there_is_named(call_command: RunCommand, tmp_path: 
     (tmp_path / "s" / "sweeps").mkdir(parents=True)
     code, _, err = call_command("report", "--sweep", "nope", "--store", "s")
     assert code == 1
-    assert err.startswith("xrgs-report: s/sweeps/nope.json: ")
+    assert err.startswith("xrgs-report: --store s is not a store")
+    (tmp_path / "s" / "cells").mkdir()
+    _, _, err = call_command("report", "--sweep", "nope", "--store", "s")
+    assert err.startswith("xrgs-report: nope: no sweeps have such an id")

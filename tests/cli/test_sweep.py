@@ -43,8 +43,13 @@ def test_a_sweep_trains_each_cell_once_and_ends_with_the_table(
     assert code == 0, err
     assert "motorcycle: building the mixed-resolution variant\n" in err
     assert "plan: 4 cells, 0 done" in err
-    assert out == "the table\n"
+    assert out.startswith("the table\n\n4 done cells\n")
     assert len(children.trained) == len(set(children.trained)) == 4
+    assert all(cell_id in out for cell_id in children.trained)
+    first, last = (str(row.cell_id)[:8] for row in Store(tmp_path / "s").sweep_record().cells[2:])
+    assert f"\n  xrgs-view {first} {last} --store s\n" in out  # a cell and its baseline
+    assert f"xrgs-data export {last} --out consistency.ply --store s" in out
+    assert out.count("xrgs-view") == 1
     code, out, err = sweep_here(*arguments)
     assert code == 0, err
     assert "plan: 4 cells, 4 done" in err
@@ -119,7 +124,8 @@ def test_a_cell_that_fails_leaves_the_others_and_is_not_tried_again(
 ) -> None:
     children.failures = {1: "it raised"}
     code, out, err = sweep_here("seed=0,1,2", *SCENE)
-    assert (code, out) == (1, "the table\n")
+    assert code == 1
+    assert out.startswith("the table\n\n2 done cells\n")
     assert "failed: it raised" in err
     assert len(children.trained) == 3
     code, _, err = sweep_here("seed=0,1,2", *SCENE)
@@ -255,6 +261,8 @@ def test_a_launcher_named_in_an_ablation_is_refused(sweep_here: SweepHere, tmp_p
         (["scene=folder"], ["scene.path"]),
         (["scene=folder", "scene.path=gone"], ["gone"]),
         (["scene=folder", "scene.path=empty"], ["empty"]),
+        (["scene.path=empty"], ["write scene=folder scene.path=empty"]),
+        (["scene=motorcycle", "scene.path=a b"], ["write scene=folder 'scene.path=a b'"]),
         (["scene=folder", "scene.path=one"], ["one"]),
         (["store=in-the-way"], ["in-the-way", "store="]),
         (["train.steps=0"], ["train.steps"]),
@@ -381,6 +389,17 @@ def test_a_dry_run_says_once_how_to_download_missing_scenes(
     (tmp_path / "data/llff/fern").mkdir(parents=True)
     code, _, err = sweep_here(*study)
     assert err.count("xrgs-data download llff flower\n") == 1
+
+
+@pytest.mark.parametrize("given", ["data", "data/llff/fern"])
+def test_a_data_root_a_level_off_is_answered_with_the_right_one(
+    sweep_here: SweepHere, tmp_path: Path, given: str
+) -> None:
+    (tmp_path / "data/llff/fern").mkdir(parents=True)
+    code, _, err = sweep_here("scene=llff/fern", f"data_root={given}", "dry_run=true")
+    assert code == 1
+    assert "data/llff/fern is there: data_root=data/llff\n" in err
+    assert "download" not in err
 
 
 def test_captures_are_looked_for_in_data_root(sweep_here: SweepHere, tmp_path: Path) -> None:

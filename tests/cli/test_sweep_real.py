@@ -6,6 +6,7 @@ Both are forks of a process that has imported torch (`tests.forks`).
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -27,7 +28,7 @@ def test_a_sweep_ends_with_the_table_and_where_it_is(swept: tuple[Path, str]) ->
     assert "n/a" in out
     assert "one replicate: no interval" in out
     assert "↑" in out or "↓" in out
-    written = folder / out.strip().rpartition("Written to ")[2]
+    (written,) = map(folder.joinpath, re.findall(r"^Page: (.*)/report\.html$", out, re.MULTILINE))
     assert {"table.md", "table.tex", "table.csv"} <= {file.name for file in written.iterdir()}
 
 

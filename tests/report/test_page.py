@@ -163,7 +163,7 @@ def test_the_terminal_has_table_failures_and_folder(study: Any) -> None:
     assert "consistency against baseline: 2 of 3 scenes, seed 0" in report.text
     assert "+0.40 ↑" in report.text
     assert "leaves: 3 of 24 views registered" in report.text
-    assert report.text.endswith(f"Written to {report.folder}")
+    assert report.text.endswith(f"Page: {report.folder / 'report.html'}")
 
 
 def test_scores_are_kept_view_by_view(study: Any) -> None:

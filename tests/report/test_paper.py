@@ -17,7 +17,7 @@ from xrgs.report.compare import compare
 from xrgs.report.context import Context
 from xrgs.report.joined import JoinedStore
 from xrgs.report.page import build
-from xrgs.report.paper import paper_tables, texture, texture_tables, with_texture
+from xrgs.report.paper import paper_tables, texture, texture_tables, why_no_table, with_texture
 from xrgs.runtime.text import TextTable
 from xrgs.training.components.texture import gradient_magnitude
 
@@ -104,8 +104,14 @@ def test_other_scenes_labels_or_bases_have_no_table(made: Any) -> None:
     assert tables(made) == []
     add(made, SCENES[0], "xrgs", seed=1)
     assert tables(made, against="consistency") == []
+    assert why_no_table(["consistency", "xrgs"], SCENES) == ""
     add(made, "garden")
     assert tables(made) == []
+    why = why_no_table(["consistency", "xrgs"], [*SCENES, "garden"])
+    assert "have scenes outside it: garden. " in why
+    assert f"--scenes {' '.join(sorted(SCENES))}`" in why
+    assert why_no_table(["consistency"], [*SCENES, "garden"]) == ""  # no full XR-GS
+    assert why_no_table(["xrgs"], ["garden"]) == ""
 
 
 def test_the_page_has_the_table_once(made: Any) -> None:

@@ -189,7 +189,7 @@ def test_damaged_cells_are_left_out(past: Past, spoilt: str) -> None:
 @pytest.fixture
 def sizes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[Conf], estimate._Sizes]:
     """The sizes of a cell on a trimmed variant of two HR and two LR views."""
-    estimate._views.cache_clear()
+    estimate.read_views.cache_clear()
 
     def view(name: str, split: str, tag: str, side: int, need: float) -> SimpleNamespace:
         size = {"width": side, "height": side}

@@ -68,6 +68,10 @@ def test_every_cell_is_counted_and_told_why(store: Store) -> None:
     lines = [line.split() for line in text.splitlines()]
     assert ["statue", "baseline", "1"] in lines
     assert ["statue", "consistency", "1", "1"] in lines
+    done = text.partition("done, the latest first:\n")[2].partition("\n\n")[0]
+    assert {line.strip() for line in done.splitlines()} == {
+        *("good  statue / baseline", "stale  statue / consistency", "twice  motorcycle / ?")
+    }
 
 
 def test_a_stale_cell_names_the_parts_that_are_others_now(store: Store) -> None:

@@ -364,8 +364,12 @@ def test_a_dry_run_reads_the_headers_of_photographs(
     conf = compose("scene=folder", f"scene.path={scene}")
     planned = plan(conf, store, allow_build=False)
     if readable == 4:
-        (note,) = planned.notes
+        note, becomes = planned.notes
         assert note.startswith("left out: x.jpg (unreadable or truncated image")
+        assert becomes == (
+            "4 photographs: 1 held out, 3 to train on, 1 of which are made 5 times smaller;"
+            " variant.hr_fraction=1 leaves them as they are"
+        )
         assert planned == PlannedVariant(notes=planned.notes)
     else:
         assert planned.error is not None
@@ -387,15 +391,15 @@ def photographs(folder: Path, count: int, size: tuple[int, int] = (120, 80)) -> 
             2,
             (120, 80),
             (),
-            "1 HR, 0 LR and 1 test views; .* needed. 1 of 2 photographs is held out: "
-            "variant.test_every=0 (tests are then on the training views), or add photographs",
+            "scene scene: 2 photographs are too few: 1 is held out to test on, and 1 left to train"
+            " on, which takes two. Add photographs, or hold none out: variant.test_every=0",
         ),
         (5, (40, 30), (), "0 photograph(s) can be used.*lower variant.factor to 2"),
         (
             5,
             (120, 80),
             ("variant.test=[1,2,3,4]",),
-            "1 HR, 0 LR and 4 test views; .*4 of 5 photographs are held out: name fewer or others",
+            "5 photographs are too few: 4 are held out.* or name fewer or others in variant.test",
         ),
         (5, (120, 80), ("variant.tags=megapixels",), "every training view is HR"),
     ],
@@ -423,7 +427,8 @@ def test_photographs_of_which_too_few_are_trained_on_are_refused_before_sfm(
     conf = compose("scene=folder", f"scene.path={photographs(tmp_path / 'scene', 2)}")
     monkeypatch.setattr(worker, "run_in_child", unexpected)
     planned = plan(conf, store, allow_build=True)
-    assert "1 of 2 photographs is held out: variant.test_every=0" in str(planned.error)
+    assert "1 is held out to test on" in str(planned.error)
+    assert "HR" not in str(planned.error)
     assert not planned.remembered
     monkeypatch.setattr(worker, "run_in_child", fail)  # with every photograph, SfM is tried
     conf.variant.test_every = 0
@@ -434,11 +439,13 @@ def test_a_plan_says_that_no_view_is_lr(
     compose: Callable[..., Conf], store: Store, tmp_path: Path
 ) -> None:
     conf = compose("scene=folder", f"scene.path={photographs(tmp_path / 'scene', 3)}")
+    becomes = "3 photographs: 1 held out, 2 to train on, as they are"
     assert plan(conf, store, allow_build=False).notes == (
+        becomes,
         "no LR view: 2 training photographs are all HR by variant.min_hr=2; nothing is mixed",
     )
     conf.variant.hr_fraction = 1.0  # asked for
-    assert plan(conf, store, allow_build=False).notes == ()
+    assert plan(conf, store, allow_build=False).notes == (becomes,)
 
 
 def test_a_variant_that_is_found_says_what_the_folder_has_got_since(

@@ -9,6 +9,8 @@ import pytest
 
 from xrgs.errors import StoreError, XrgsError
 from xrgs.experiment.attempts import begin_attempt
+from xrgs.experiment.listing import Selection
+from xrgs.experiment.schema import RecordedCell
 from xrgs.experiment.store import Store
 from xrgs.splat.files import save_gaussians
 from xrgs.splat.ply import save_ply
@@ -39,10 +41,53 @@ def test_a_cell_is_found_by_the_beginning_of_its_id(store: Store) -> None:
     assert models.find_cell("abd2", store).id == "abd2"
 
 
+def recorded(store: Store, **scenes: str) -> str:
+    """Record the scenes of cells, by the cells' ids."""
+    rows = [
+        RecordedCell(cell_id, "plus", "", scene, 0, 0, None, None)
+        for cell_id, scene in scenes.items()
+    ]
+    return store.write_sweep(["x"], rows)
+
+
+def test_a_cell_is_found_by_its_scene_where_one_is_done(
+    store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sweep = recorded(store, abc1="garden", abd2="my bike", abd3="garden")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "photos/garden/images").mkdir(parents=True)
+    for word in ("garden", "photos/garden", "photos/garden/", "photos/garden/images"):
+        assert models.find_cell(word, store).id == "abc1"
+    assert models.find_cell("my bike", store).id == "abd2"
+    (store.cell("abd2").path / "identity.json").write_text("{}")
+    assert models.find_cell(str(store.cell("abd2").path), Store("gone")).id == "abd2"
+    assert store.find_folder("garden") == store.cell("abc1").path
+    rows = store.cell_rows()
+    assert [row.id for row in Selection(ids=("garden",)).of(rows)] == ["abc1"]
+    for word in (sweep, sweep[:6], "my bike", "photos/garden"):
+        assert store.find_sweep(word) == sweep
+    with pytest.raises(StoreError, match=r"^house: no sweeps have such an id"):
+        store.find_sweep("house")
+
+
+def test_a_scene_with_several_done_cells_names_them(store: Store) -> None:
+    recorded(store, abc1="garden", abd2="garden")
+    for find in (store.find_cell, store.find_folder):
+        with pytest.raises(StoreError, match=r"^garden: several .*: abc1 \(plus\), abd2 \(plus\)"):
+            find("garden")
+
+
+def test_a_scene_and_an_id_of_another_cell_are_told_apart(store: Store) -> None:
+    recorded(store, abd2="abc")
+    with pytest.raises(StoreError, match=r"^abc: several cells .*: abc1, abd2 \(plus\)"):
+        store.find_cell("abc")
+    assert store.find_cell("abc1").id == "abc1"
+
+
 @pytest.mark.parametrize(
     ("word", "message"),
     [
-        ("ab", "ab: several cells have such an id: abc1, abd2, abd3"),
+        ("ab", "ab: several cells have such an id or scene: abc1, abd2, abd3"),
         ("x", "x: no cells have such an id"),
         ("../abc1", "../abc1: no cells have such an id"),
         ("abd3", "abd3: it is failed and not done: out of memory"),

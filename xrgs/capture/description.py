@@ -6,7 +6,7 @@ Nothing here imports torch.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from msgspec import Struct, structs
@@ -22,9 +22,10 @@ from xrgs.safeio.records import read_struct
 from xrgs.safeio.sanitize import for_line
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
 
-    from xrgs.capture.views import Variant
+    from xrgs.capture.frozen import ViewEntry
+    from xrgs.capture.views import Variant, View
 
 
 #: Views have one camera where the angle between them, in degrees, and the distance, as a share of
@@ -34,6 +35,8 @@ _SAME_ANGLE, _SAME_PLACE = 0.1, 0.01
 #: The least share of coarse training views in a mixture. Our choice: `plus` gains 0.81 dB with a
 #: share of 0.45 (monstree), and no PSNR with 0.11 (reichstag).
 _MIXTURE_FROM = 0.25
+#: The recipe (a file of `conf/ablation/`) for a mixture, and the one for photographs alike.
+MIXTURE_RECIPE, ALIKE_RECIPE = "plus", "keep_large"
 
 
 class SfmAttempt(Struct):
@@ -204,17 +207,40 @@ def _counts(frozen: Variant) -> Iterator[str]:
         yield f"originals of degraded views kept beside them: {originals}"
 
 
+class Mixture(NamedTuple):
+    """How many training views are coarse: they would need at least 1.5 times as many px a side."""
+
+    coarse: int
+    views: int
+
+    @property
+    def recipe(self) -> str:
+        """The recipe for such views."""
+        return MIXTURE_RECIPE if self.is_one else ALIKE_RECIPE
+
+    @property
+    def is_one(self) -> bool:
+        """Whether so many views are coarse that all are a mixture."""
+        return self.coarse >= _MIXTURE_FROM * self.views
+
+
+def mixture(views: Iterable[View | ViewEntry]) -> Mixture:
+    """Count the coarse training views among the views of a variant."""
+    needs = [view.need for view in views if view.split == "train"]
+    # `supersampled`, and so the recipes, render a view larger by its need, rounded.
+    return Mixture(sum(round(need) > 1 for need in needs), len(needs))
+
+
 def _mixture(frozen: Variant) -> str:
     """Say whether the training views are a mixture, and which recipe is for it."""
-    needs = [view.need for view in frozen.views if view.split == "train"]
-    # `supersampled`, and so both recipes, render a view larger by its need, rounded.
-    coarse = sum(round(need) > 1 for need in needs)
-    mixture, recipes = "hardly a mixture", "+ablation=keep_large is for such views"
-    if coarse >= _MIXTURE_FROM * len(needs):
-        mixture, recipes = "a mixture", "+ablation=plus and +ablation=lean are for mixtures"
+    found = mixture(frozen.views)
+    recipes = f"+ablation={ALIKE_RECIPE} is for such views"
+    if found.is_one:
+        recipes = f"+ablation={MIXTURE_RECIPE} and +ablation=lean are for mixtures"
     return (
-        f"{mixture}: {coarse} of {len(needs)} training views would need at least 1.5 times as many"
-        f" px a side to show the scene as finely as the finest; {recipes}"
+        f"{'a mixture' if found.is_one else 'hardly a mixture'}: {found.coarse} of {found.views}"
+        " training views would need at least 1.5 times as many px a side to show the scene as"
+        f" finely as the finest; {recipes}"
     )
 
 

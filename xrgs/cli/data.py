@@ -10,13 +10,22 @@ from tyro.conf import Positional, arg
 from tyro.extras import literal_type_from_choices
 
 from xrgs import config
+from xrgs.capture.folders import is_failed
+from xrgs.capture.frozen import MANIFEST
+from xrgs.capture.scenes.scene import ALL_BELOW
 from xrgs.cli import options
 from xrgs.cli.options import STORE, Folder, Names, OptionalFolder, shown_as
+from xrgs.cli.photographs import as_they_are, last_of_each_key
 from xrgs.errors import XrgsError
+from xrgs.experiment.cell_folder import IDENTITY, CellFolder
+from xrgs.experiment.export import SPLAT_FORMATS
 from xrgs.experiment.store import Store
 from xrgs.runtime.streams import say
+from xrgs.safeio.paths import user_path
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     Dataset = str
 else:
     Dataset = literal_type_from_choices(
@@ -79,61 +88,114 @@ def lpips(
 
 
 def inspect(
-    variant: Positional[Annotated[tuple[str, ...], shown_as("FOLDER|KEY=VALUE ...")]],
+    variant: Positional[Annotated[tuple[str, ...], shown_as("FOLDER|CELL|KEY=VALUE ...")]],
     out: Annotated[Path | None, shown_as("FILE.png")] = None,
 ) -> None:
     """Print a table of a variant's views and the result of SfM, and draw all views on one sheet.
 
     Args:
-        variant: The variant's folder; or what it is made of, by overrides of Hydra as xrgs-sweep
-            takes them: scene=llff/fern variant.factor=4. A variant that the store lacks is built.
+        variant: A folder of photographs, as they are; overrides may follow. Or what the variant is
+            made of, by overrides of Hydra as xrgs-sweep takes them: scene=llff/fern
+            variant.factor=4. A variant that the store lacks is built. Or the variant's folder or
+            its id, or a cell of it.
         out: The file of the sheet; by default it is named after the variant.
     """
-    from xrgs import composing
     from xrgs.capture.description import describe
+
+    if not variant:
+        raise XrgsError("inspect: give a folder of photographs, or scene=NAME and other keys")
+    say(describe(_variant(variant), out))
+
+
+def _variant(words: Sequence[str]) -> Path:
+    """Return the folder of the variant that the words of `inspect` name; it is built if need be."""
+    from xrgs import composing
     from xrgs.cli.hydra_words import explained, with_quotes
     from xrgs.sweep import variants
 
-    if not variant:
-        raise XrgsError("inspect: give a variant's folder, or scene=NAME and other keys")
-    folder = Path(variant[0])
-    if len(variant) > 1 or ("=" in variant[0] and not folder.exists()):
-        with explained():
-            conf = composing.compose(*with_quotes(variant))
-            store = Store(Path(conf.store))
-            folder = store.variants / variants.find_or_build(conf, store)
-    say(describe(folder, out))
+    first, *others = words
+    path = user_path(first.removesuffix(ALL_BELOW))
+    if is_failed(path.name) or (path / MANIFEST).is_file():
+        return path
+    if path.exists() and not (path / IDENTITY).is_file():
+        words = last_of_each_key([*as_they_are(first), *others])
+    elif "=" not in first:
+        store = Store(next((w[6:] for w in others if w.startswith("store=")), STORE))
+        if not path.exists() and not store.exists:
+            raise XrgsError(f"{first}: there is no such folder, and no store {store.path}")
+        folder = store.find_folder(first)
+        is_cell = (folder / IDENTITY).is_file()
+        return CellFolder(folder.absolute()).variant().folder if is_cell else folder
+    with explained():
+        conf = composing.compose(*with_quotes(words))
+        store = Store(Path(conf.store))
+        return store.variants / variants.find_or_build(conf, store)
 
 
 def export(
     name: Positional[Annotated[str, arg(metavar="CELL|VARIANT|FILE")]],
     layout: Annotated[
-        Literal["colmap", "nerfstudio", "ply", "glb", "spz"], arg(name="format")
-    ] = "colmap",
+        Literal["auto", "colmap", "nerfstudio", "ply", "glb", "spz"], arg(name="format")
+    ] = "auto",
     out: Annotated[Path | None, shown_as("FOLDER|FILE")] = None,
     store: Folder = STORE,
 ) -> None:
     """Write a cell or a variant for other programs, or convert a file of Gaussians.
 
     Args:
-        name: A cell or a variant: its folder, or its id in the store or the beginning of the id. A
-            .ply, .glb or .spz file is converted to another of these.
-        layout: `colmap` and `nerfstudio`: a folder of images, cameras, points and split, and the
-            splats of a cell. `ply`, `glb` (glTF with KHR_gaussian_splatting) and `spz` (8 bits a
-            value): one file of Gaussians.
-        out: The new folder or file to write; by default it is named after what is exported.
+        name: A cell or a variant: its id in the store or the beginning of the id, its folder, or
+            the name of a scene with one done cell. A .ply, .glb or .spz file is converted to
+            another of these.
+        layout: `ply`, `glb` (glTF with KHR_gaussian_splatting) and `spz` (8 bits a value): one file
+            of Gaussians. `colmap` and `nerfstudio`: a folder of images, cameras, points and split,
+            and the splats of a cell. `auto`: by the end of --out, where a folder is COLMAP's.
+        out: The file to write, which is replaced, or a new folder; by default it is named after
+            what is exported.
         store: The store.
     """
-    from xrgs.experiment.export import SPLAT_FORMATS, export_splats
-    from xrgs.experiment.export import export as write
+    path = user_path(name)
+    is_other_path = path.name != name and not path.is_dir()
+    if path.suffix.lower()[1:] not in SPLAT_FORMATS and not is_other_path:
+        there = Store(store)
+        path = path if path.is_dir() and not there.exists else there.find_folder(name)
+    say(write_export(path, out, layout))
 
-    path = Path(name)
-    if not path.exists() and path.name == name and path.suffix[1:] not in SPLAT_FORMATS:
-        path = Store(store).find_folder(name)
+
+def form_of(out: Path) -> str:
+    """Return the format of an export, by the end of the name that it is written to.
+
+    Raises:
+        XrgsError: The end is of no format.
+    """
+    if (form := out.suffix.lower()[1:]) in SPLAT_FORMATS:
+        return form
+    if out.suffix:
+        known = ", ".join(f".{form}" for form in SPLAT_FORMATS)
+        raise XrgsError(f"out={out}: a file ends with {known}; a folder has no suffix")
+    return "colmap"
+
+
+def write_export(path: Path, out: Path | None, layout: str = "auto") -> str:
+    """Write an export, and return a line on it.
+
+    Args:
+        path: The folder of a cell or a variant, or a file of Gaussians.
+        out: The file or the folder to write; None names it after `path`.
+        layout: The format; `auto` takes the one of `out`.
+
+    Raises:
+        XrgsError: The cell can't be exported so, or `out` can't be written.
+    """
+    from xrgs.experiment.export import export as write
+    from xrgs.experiment.export import export_splats
+
+    if layout == "auto":
+        layout = "colmap" if out is None else form_of(out)
     if layout in SPLAT_FORMATS:
-        say(export_splats(path, layout, out or Path(f"{path.stem}.{layout}")))
-    else:
-        say(write(path, layout, out or Path(f"{path.name}-{layout}")))
+        return export_splats(path, layout, out or Path(f"{path.stem}.{layout}"))
+    if out is not None and out.suffix.lower()[1:] in SPLAT_FORMATS:
+        raise XrgsError(f"out={out}: --format {layout} writes a folder, and this names a file")
+    return write(path, layout, out or Path(f"{path.name}-{layout}"))
 
 
 def main() -> None:

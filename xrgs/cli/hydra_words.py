@@ -5,8 +5,9 @@ from __future__ import annotations
 import re
 import shlex
 from contextlib import contextmanager, suppress
+from dataclasses import is_dataclass
 from itertools import accumulate, pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Quote, QuotedString
@@ -37,6 +38,21 @@ _QUOTED, _QUOTED_PART = (
 _DEPTH = dict.fromkeys("([{", 1) | dict.fromkeys(")]}", -1)
 #: The key or the resolver of an interpolation.
 _INTERPOLATED = re.compile(r"\$\{([^:}]*)")
+#: Options of Hydra; those of the second set have a value.
+_HYDRA_OPTIONS = frozenset(
+    {"-h", "--help", "--hydra-help", "--version", "--resolve", "--run", "-r", "--multirun", "-m"}
+    | {"--shell-completion", "-sc"}
+)
+_HYDRA_VALUES = frozenset(
+    {"--cfg", "-c", "--package", "-p", "--config-path", "-cp", "--config-name", "-cn"}
+    | {"--config-dir", "-cd", "--experimental-rerun", "--info", "-i"}
+)
+#: Keys that are switched on by `true`.
+_FLAGS = frozenset({"dry_run", "fail_fast"})
+#: The most names that a message lists.
+_MAX_LISTED = 20
+#: A number that is whole, and not written so: 3e3, 100.0.
+_WHOLE = re.compile(r"\d+(?:\.\d*)?(?:[eE]\+?\d+)?|\d+\.0*")
 #: Keys whose values are lists of names.
 _NAMES = frozenset({"variant.test"})
 #: Keys whose values are paths.
@@ -90,7 +106,10 @@ def _missing_file(file: str, options: Sequence[str]) -> str:
     if group == "scene" and user_path(name).is_dir():
         word = shlex.quote(f"scene.path={name}")
         return f"scene={name}: a folder of photographs is given as scene=folder {word}"
-    offered = did_you_mean(name, known) or f"; choose from: {', '.join(known)}"
+    all_known = f"; choose from: {', '.join(known)}"
+    if len(known) > _MAX_LISTED:
+        all_known = f"; xrgs-sweep --help lists all {len(known)}"
+    offered = did_you_mean(name, known) or all_known
     return f"{group}={name}: there is no such choice{offered}"
 
 
@@ -131,9 +150,26 @@ def _with_quotes(word: str) -> str:
     elif key in _PATHS:
         parts = value.split(",") if key == "scene.path" and not _exists(value) else [value]
         quoted = ",".join(_quoted_path(key, part) for part in parts)
+    elif _is_whole_number(key):
+        quoted = ",".join(map(_whole, value.split(",")))
     else:
         quoted = value
     return f"{signed}={quoted}"
+
+
+def _is_whole_number(key: str) -> bool:
+    """Return whether a key of the schema is a whole number."""
+    kind: Any = config.Conf
+    for name in key.split("."):
+        kind = config.types_of(cast("Any", kind)).get(name) if is_dataclass(kind) else None
+    return kind is int
+
+
+def _whole(text: str) -> str:
+    """Return a whole number as digits, `3000` for `3e3`; another text as it is."""
+    if not _WHOLE.fullmatch(text.strip()) or not (value := float(text)).is_integer():
+        return text
+    return str(int(value))
 
 
 def _exists(path: str) -> bool:
@@ -199,6 +235,58 @@ def _parts(text: str) -> list[str]:
         depths = [0] * len(text)
     cuts = [i for i, char in enumerate(shape) if char == "," and depths[i] == 0]
     return [text[begin + 1 : end] for begin, end in pairwise([-1, *cuts, len(text)])]
+
+
+def check_words(words: Sequence[str]) -> None:
+    """Refuse words that are no overrides of Hydra and none of its options, and say what was meant.
+
+    Raises:
+        XrgsError: A folder, an option of another command, or a list with spaces; the message has
+            what to type.
+    """
+    before = ""
+    for number, word in enumerate(words):
+        key, is_assignment, _ = word.partition("=")
+        name = key.lstrip("-").replace("-", "_")
+        if before in _HYDRA_VALUES:  # its value
+            before = ""
+            continue
+        is_option = word.startswith("-") and key not in _HYDRA_OPTIONS | _HYDRA_VALUES
+        if is_option and name in config.known_keys():
+            following = words[number + 1 : number + 2]
+            value = "true" if name in _FLAGS else (following or ["VALUE"])[0]
+            meant = word.lstrip("-") if is_assignment else f"{name}={value}"
+            raise XrgsError(f"{word}: there is no such option; write {shlex.quote(meant)}")
+        if is_option:
+            raise XrgsError(f"{word}: there is no such option; see xrgs-sweep --help")
+        if not is_assignment and word[:1] not in {"-", "~"}:
+            raise XrgsError(_meant(word, before))
+        before = word
+
+
+def _meant(word: str, before: str) -> str:
+    """Return the message about a word that is neither KEY=VALUE nor an option."""
+    if "=" in before and (before.endswith((",", "[")) or word.startswith((",", "]"))):
+        return f"{before} {word}: write it without the space: {shlex.quote(before + word)}"
+    path = user_path(word.removesuffix(ALL_BELOW))
+    if path.exists():
+        return f"{word}: to train on these photographs, type: xrgs-train {shlex.quote(word)}"
+    if word in files("ablation"):
+        return f"{word}: an ablation is given as +ablation={word}"
+    if scene := next((s for s in files("scene") if s.rpartition("/")[2] == word), ""):
+        return f"{word}: a scene is given as scene={scene}"
+    return f"{word}: write KEY=VALUE, as scene=llff/fern; photographs are trained by xrgs-train"
+
+
+def check_no_axis(words: Sequence[str]) -> None:
+    """Refuse overrides with several values, where one cell is trained.
+
+    Raises:
+        XrgsError: An override is an axis; the message names it.
+    """
+    for word in words:
+        if (override := _parsed(word)) and override.is_sweep_override():
+            raise XrgsError(f"{word}: give one value; xrgs-sweep takes several")
 
 
 def files(group: str) -> list[str]:

@@ -11,15 +11,17 @@ import os
 import re
 import sys
 from contextlib import contextmanager
-from dataclasses import fields, is_dataclass
+from dataclasses import is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeAlias, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, get_type_hints
 
 import tyro
 from tyro.conf import CascadeSubcommandArgs, DisallowNone, FlagCreatePairsOff, OmitArgPrefixes, arg
 
 import xrgs
+from xrgs.config import known_keys
 from xrgs.errors import XrgsError
+from xrgs.experiment.store import DEFAULT_STORE
 from xrgs.runtime.streams import guard_streams, say
 from xrgs.safeio.paths import user_path
 from xrgs.safeio.sanitize import for_line
@@ -27,7 +29,7 @@ from xrgs.safeio.sanitize import for_line
 if TYPE_CHECKING:
     from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 
-STORE = Path("xrgs-store")
+STORE = DEFAULT_STORE
 
 
 def shown_as(metavar: str) -> object:
@@ -64,18 +66,20 @@ def run(
             or one for each subcommand.
         description: What the help of a command with subcommands says first.
         default: The subcommand that is meant where none is named.
-        overrides: The subcommand that takes Hydra's overrides, `KEY=VALUE`.
+        overrides: The subcommand that takes Hydra's overrides, `KEY=VALUE`; or `command`, where
+            there are no subcommands.
 
     Raises:
         SystemExit: With code 1 on an `XrgsError`, and with code 2 on wrong usage.
     """
     guard_streams()
     answer_version(command)
-    # Of a subcommand with overrides, `out` alone is an option that is no key of Hydra's config.
-    name = "out" if sys.argv[1:2] == [overrides] else "[a-z][a-z_]*"
+    functions = {command: target} if callable(target) else target
+    known = frozenset(name for function in functions.values() for name in _names(function))
+    name = "[a-z][a-z_]*"
+    if overrides in {command, *sys.argv[1:2]}:
+        name = "|".join({*_names(functions[overrides])} - {*known_keys()})
     assignment = re.compile(f"({name})=(.*)", re.DOTALL)
-    functions = [target] if callable(target) else target.values()
-    known = frozenset(name for function in functions for name in _names(function))
     words = _with_options(sys.argv[1:], assignment, known)
     with errors_as_messages(command, assignment):
         if callable(target):
@@ -93,11 +97,11 @@ def _unwrapped(function: Callable[..., None]) -> Callable[..., None]:
     return function
 
 
-def _names(function: Callable[..., None]) -> Iterator[str]:
-    """Yield the names of a function's options, those of its dataclasses among them."""
-    for name, hint in get_type_hints(function, include_extras=True).items():
+def _names(options: Any) -> Iterator[str]:
+    """Yield the names of a function's options, or of a dataclass, with those of its dataclasses."""
+    for name, hint in get_type_hints(options, include_extras=True).items():
         if is_dataclass(hint):
-            yield from (field.name for field in fields(hint))
+            yield from _names(hint)
         given = (getattr(mark, "name", None) for mark in getattr(hint, "__metadata__", ()))
         yield next(filter(None, given), name)
 

@@ -31,8 +31,8 @@ def render(
     """Render trained cells along a path of cameras; two of them side by side with their names.
 
     Args:
-        cells: One cell or two, each by its id, the beginning of its id, or a file: .ply, .glb or
-            .spz.
+        cells: One cell or two, each by its id, the beginning of its id, the name of a scene with
+            one done cell, or a file: .ply, .glb or .spz.
         path: The path, fitted to the training cameras. `orbit` circles around the point that they
             look at; where they see it from one side alone, it swings over the arc that they span.
             `spiral` is LLFF's, for forward-facing scenes. `test` goes through the test cameras in

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import arg
 
 from xrgs.cli import options
 from xrgs.cli.options import STORE, Folder, Names, OptionalFolder, shown_as
+from xrgs.errors import StoreError
 from xrgs.experiment.store import BASELINE, Store
 from xrgs.runtime.streams import say
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 _DESCRIPTION = """\
 Make the tables and figures of a sweep from a store alone; the same store gives the same bytes.
@@ -37,8 +41,9 @@ def report(
 
     Args:
         store: The store. With several, a cell is looked for in each.
-        sweep: Id of the sweep; several are joined, for example one of each scene. By default the
-            latest, and with several stores the latest of each.
+        sweep: The sweep: its id, the beginning of it, or the name of a scene for the latest sweep
+            of it. Several are joined, for example one of each scene. By default the latest, and
+            with several stores the latest of each.
         scenes: The scenes in the report; all by default.
         ablations: The ablations in the report, beside what they are compared with; all by default.
         out: Folder to write to. By default reports/ID in the first store; with a choice
@@ -65,7 +70,23 @@ def report(
     choice = Choice(scenes, ablations)
     design = Design(outcomes or Design.outcomes, headline, margin_psnr, margin_lpips)
     others = parse(external)
-    say(build(list(store), sweep or None, out, drawn, against, choice, others, design).text)
+    ids = [find_sweep([Store(path) for path in store], word) for word in sweep]
+    say(build(list(store), ids or None, out, drawn, against, choice, others, design).text)
+
+
+def find_sweep(stores: Sequence[Store], word: str) -> str:
+    """Return the id of the sweep that a word names in the first of the stores that has one.
+
+    Raises:
+        StoreError: None has; the message is the first store's.
+    """
+    errors = []
+    for store in stores:
+        try:
+            return store.find_sweep(word)
+        except StoreError as error:
+            errors.append(error)
+    raise errors[0]
 
 
 def list_sweeps(store: Folder = STORE) -> None:

@@ -8,10 +8,10 @@ from xrgs.runtime.streams import say
 
 
 def status(store: Folder = STORE, watch: Flag = False) -> None:
-    """Print what a store holds: cells by state, why cells failed, which are stale, and sizes.
+    """Print what a store holds: cells by state, ids of done cells, why others failed, and sizes.
 
-    It also says which cell is trained now, and for which sweep. `xrgs-store list` lists single
-    cells, and `xrgs-store check` verifies them.
+    It also says which cell is trained now, and for which sweep. `xrgs-store list` lists all cells,
+    and `xrgs-store check` verifies them.
 
     Args:
         store: The store.

@@ -30,7 +30,7 @@ class Filter:
     """Which cells of a store are meant."""
 
     ids: Positional[Cells] = ()
-    """Cells, each by its id or the beginning of its id; all by default."""
+    """Cells: ids, beginnings of ids, or scenes with one done cell; all by default."""
     scenes: Names = ()
     """Only cells of these scenes."""
     ablations: Names = ()
@@ -104,7 +104,7 @@ def show(cell: Positional[Annotated[str, arg(metavar="CELL")]], store: Folder = 
     """Show a cell: how its config differs from its baseline, scores, files, provenance, sweeps.
 
     Args:
-        cell: The cell's id, or the beginning of it.
+        cell: The cell's id, or the beginning of it, or the name of a scene with one done cell.
         store: The store.
     """
     from xrgs.experiment.listing import Selection

@@ -15,7 +15,7 @@ from hydra.errors import CompactHydraException
 from omegaconf import MISSING, DictConfig, OmegaConf
 
 from xrgs import config
-from xrgs.cli.hydra_words import explained, files, with_quotes
+from xrgs.cli.hydra_words import check_words, explained, files, with_quotes
 from xrgs.cli.key_help import explain
 from xrgs.cli.options import answer_version, errors_as_messages
 from xrgs.composing import escape_interpolations
@@ -43,13 +43,19 @@ Commas make axes, +ablation=[a,b] stacks. Finished cells are found in the store 
   retry=failed      fail_fast=true        train failed cells again; stop after the first failure
   baseline=false                          train the ablations alone
 
-xrgs-sweep rerun=CELL_FOLDER [out=FOLDER] [store=FOLDER] [threads=N] [scene.path=FOLDER]
+xrgs-sweep rerun=CELL [out=FOLDER] [store=FOLDER] [threads=N] [scene.path=FOLDER]
            [plugins=NAME[,NAME]...]
   trains a finished cell again in another folder, and prints "the same, bit for bit" or what differs
 
 help=KEY explains a key, e.g. help=train.steps or help=variant; --cfg job prints all keys with their
 values; --config-dir FOLDER adds YAML files of your own; --hydra-help explains Hydra's own options.
 """
+
+_NOTHING = """\
+xrgs-sweep: say what to train:
+  xrgs-train FOLDER                    a scene of your photographs
+  xrgs-sweep +ablation=consistency     the baseline and one change, on the embedded scene
+  xrgs-sweep --help                    all ablations, scenes and studies"""
 
 
 @dataclass
@@ -65,7 +71,7 @@ class RerunConf:
     """Arguments of `xrgs-sweep rerun=...`; any other value would make it another cell."""
 
     rerun: str = MISSING
-    """The cell's folder."""
+    """The cell: its folder, or its name in the store."""
     out: str | None = None
     """Folder to write to; None for `<rerun>.rerun-1` or the next free number."""
     store: str | None = None
@@ -114,12 +120,29 @@ def main() -> None:
         ):
             _rerun(arguments)
         return
+    if not arguments:
+        say(_NOTHING, sys.stderr)
+        sys.exit(2)
+    with errors_as_messages("xrgs-sweep"):
+        check_words(arguments)
     # The plus that Hydra requires before these two is forgotten easily.
     words = ["+" + w if w.partition("=")[0] in config.PLUS_GROUPS else w for w in arguments]
-    with (
-        exit_on_signal("Finished cells are kept: run the same command again to continue."),
-        _hydra_errors("xrgs-sweep"),
-    ):
+    run("xrgs-sweep", words, "Finished cells are kept: run the same command again to continue.")
+
+
+def run(command: str, words: Sequence[str], hint: str) -> None:
+    """Run a sweep.
+
+    Args:
+        command: Name of the command, which begins messages.
+        words: The arguments of `xrgs-sweep`.
+        hint: What is said where a signal ends it: what is kept, and how to continue.
+
+    Raises:
+        SystemExit: With code 1 where a cell failed; with a message where the user can correct the
+            problem.
+    """
+    with exit_on_signal(hint), _hydra_errors(command):
         sys.argv[1:] = with_quotes(words)
         _run_job()
 
@@ -143,6 +166,7 @@ def _hydra_errors(command: str) -> Iterator[None]:
 
 
 def _rerun(arguments: list[str]) -> None:
+    from xrgs.experiment.store import DEFAULT_STORE, Store
     from xrgs.sweep.rerun import rerun
 
     hint = " (rerun= takes out=, store=, threads=, scene.path= and plugins=)"
@@ -150,7 +174,10 @@ def _rerun(arguments: list[str]) -> None:
         conf = OmegaConf.merge(OmegaConf.structured(RerunConf), texts(arguments))
         out, store = (Path(path) if path else None for path in (conf.out, conf.store))
         photographs, plugins = conf.scene.path, conf.plugins.split(",")
-        result = rerun(Path(conf.rerun), out, store, conf.threads, photographs, plugins)
+        cell, there = Path(conf.rerun), Store(store or DEFAULT_STORE)
+        if not cell.exists() and there.exists:
+            cell = there.find_cell(conf.rerun).path
+        result = rerun(cell, out, store, conf.threads, photographs, plugins)
     say(str(result))
     if result.differences:
         sys.exit(1)

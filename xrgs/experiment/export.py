@@ -87,21 +87,20 @@ def export_splats(path: Path, form: str, out: Path) -> str:
     Args:
         path: The folder of a finished cell, or a .ply, .glb or .spz file.
         form: One of `SPLAT_FORMATS`.
-        out: The new file.
+        out: The file, which is replaced.
 
     Returns:
         A line with the number of Gaussians that were written, and of those that the cell has.
 
     Raises:
-        XrgsError: The cell or the file can't be read, or `out` exists, ends otherwise or can't be
-            written.
+        XrgsError: The cell or the file can't be read, or `out` ends otherwise or can't be written.
     """
     from xrgs.splat.files import load_gaussians, save_gaussians
 
     if out.suffix.lower() != f".{form}":
         raise XrgsError(f"out={out}: the name of a {form} file must end with .{form}")
-    if out.exists():
-        raise XrgsError(f"out={out}: it exists; name a new file")
+    if out.is_dir():
+        raise XrgsError(f"out={out}: is a folder; name a file")
     up, total = {}, 0
     if path.suffix and not path.is_dir():
         gaussians, antialiased = load_gaussians(path)

@@ -9,10 +9,12 @@ import time
 from collections import Counter
 from dataclasses import dataclass
 from functools import cached_property
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from xrgs.errors import StoreError, XrgsError
 from xrgs.experiment.identity import changed_code
+from xrgs.runtime.text import listed
 from xrgs.safeio.files import file_bytes
 from xrgs.splat.backend import arithmetic
 
@@ -209,7 +211,7 @@ class Selection:
     """Which cells of a store are meant; an empty value or 0 restricts nothing."""
 
     ids: tuple[str, ...] = ()
-    """Ids, or beginnings of ids."""
+    """Ids, beginnings of ids, or names of scenes with one done cell."""
     scenes: tuple[str, ...] = ()
     ablations: tuple[str, ...] = ()
     states: tuple[str, ...] = ()
@@ -229,7 +231,8 @@ class Selection:
         Raises:
             XrgsError: No cell has a name that is given, or several ids have one beginning.
         """
-        wanted = {full_id(beginning, [cell.id for cell in cells]) for beginning in self.ids}
+        ids = [cell.id for cell in cells]
+        wanted = {full_id(word, ids, of_scene=_done_of(word, cells)) for word in self.ids}
         self._check("scenes", self.scenes, [cell.scene for cell in cells])
         self._check("ablations", self.ablations, [cell.label for cell in cells])
         self._check("states", self.states, STATES)
@@ -254,6 +257,11 @@ class Selection:
                 raise XrgsError(f"{key}={name}: no cell has that; choose from: {choices}")
 
 
+def _done_of(scene: str, cells: Iterable[CellRow]) -> dict[str, str]:
+    """Return the labels of the done cells of a scene, by their ids."""
+    return {c.id: c.arm for c in cells if c.scene == scene and c.state.name == "done"}
+
+
 def size_of(path: Path) -> int | None:
     """Return the bytes of a file, or of all files of a folder; None where it can't be told."""
     try:
@@ -262,22 +270,32 @@ def size_of(path: Path) -> int | None:
         return None
 
 
-def full_id(beginning: str, ids: Iterable[str], kinds: str = "cells") -> str:
-    """Return the id that begins with a text.
+def full_id(
+    word: str,
+    ids: Iterable[str],
+    kinds: str = "cells",
+    of_scene: Mapping[str, str] = MappingProxyType({}),
+) -> str:
+    """Return the id that a word names.
 
     Args:
-        beginning: An id, or the beginning of one id alone.
+        word: An id, the beginning of one id only, or the name of a scene with one done cell.
         ids: The ids to choose from.
         kinds: The things with these ids, for messages.
+        of_scene: The labels of the done cells of the scene that is named so, by their ids.
 
     Raises:
-        StoreError: No id begins with it, or several do.
+        StoreError: The word names none, or several.
     """
-    found = [one for one in ids if one.startswith(beginning)]
-    if beginning in found:
-        return beginning
+    known = [*ids]
+    if word in known:
+        return word
+    found = {one: "" for one in known if one.startswith(word)}
+    found |= {one: f" ({label})" for one, label in of_scene.items()}
     if len(found) == 1:
-        return found[0]
-    some = ", ".join([*found[:_MAX_LISTED], *["..."] * (len(found) > _MAX_LISTED)])
-    why = f"several {kinds} have such an id: {some}" if found else f"no {kinds} have such an id"
-    raise StoreError(f"{beginning}: {why}; xrgs-store list shows them")
+        return next(iter(found))
+    some = listed([f"{one}{label}" for one, label in found.items()], _MAX_LISTED)
+    why = f"no {kinds} have such an id, and no done cell is of such a scene"
+    if found:
+        why = f"several {kinds} have such an id or scene: {some}"
+    raise StoreError(f"{word}: {why}; xrgs-status lists the done ones")

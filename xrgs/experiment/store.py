@@ -16,15 +16,18 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from xrgs.capture import folders as variant_folders
+from xrgs.capture.frozen import MANIFEST
+from xrgs.capture.scenes.scene import scene_name
 from xrgs.errors import StoreError, UnreadableError
 from xrgs.experiment import listing
-from xrgs.experiment.cell_folder import CellFolder, CellState
+from xrgs.experiment.cell_folder import IDENTITY, CellFolder, CellState
 from xrgs.experiment.schema import SweepRecord
 from xrgs.runtime import lease
 from xrgs.runtime.progress import log_line
 from xrgs.safeio.atomic import write_json
 from xrgs.safeio.files import is_name, is_transient, sync_name
 from xrgs.safeio.hashing import digest
+from xrgs.safeio.paths import user_path
 from xrgs.safeio.records import list_folder, read_struct
 from xrgs.safeio.sanitize import for_line
 
@@ -39,6 +42,8 @@ if TYPE_CHECKING:
 
 #: Label of the cells that all others are compared to.
 BASELINE = "baseline"
+#: The folder of the store where none is named.
+DEFAULT_STORE = Path("xrgs-store")
 
 #: The largest record of a sweep that is read, in bytes: 100,000 cells take 30 MB.
 MAX_RECORD_BYTES = 1 << 25
@@ -290,6 +295,11 @@ class Store:
         """Return the row of the latest sweep that has each recorded cell, by the cell's id."""
         return listing.latest_records(self._records_or_warnings())
 
+    def sweeps_of(self, cell_id: str) -> list[str]:
+        """Return the ids of the recorded sweeps that have a cell, the latest last."""
+        records = self._records_or_warnings()
+        return [i for i, r in records.items() if any(row.cell_id == cell_id for row in r.cells)]
+
     def _records_or_warnings(self) -> dict[str, SweepRecord]:
         try:
             records, damaged = self.records()
@@ -299,32 +309,63 @@ class Store:
             log_line(f"{message}; its names of cells are left out")
         return records
 
-    def find_cell(self, beginning: str) -> CellFolder:
-        """Return the cell whose id begins with a text.
+    def find_cell(self, word: str) -> CellFolder:
+        """Return the cell that a word names.
 
         Args:
-            beginning: The id, or so much of it that it is that of one cell.
+            word: The cell's id, or so much of it that it is that of one cell; the name of a scene
+                that one done cell is of; or a path to the cell's folder or the scene's.
 
         Raises:
-            StoreError: There is no store, no id begins with it, or several do.
+            StoreError: There is no store, the word names no cell, or it names several.
         """
+        if (folder := user_path(word) / IDENTITY).is_file():
+            return CellFolder(folder.parent.absolute())
         self.check_exists()
-        return self.cell(listing.full_id(beginning, [cell.id for cell in self.cell_folders()]))
+        return self.cell(self._full_id(word, [cell.id for cell in self.cell_folders()], "cells"))
 
-    def find_folder(self, beginning: str) -> Path:
-        """Return the folder of the cell or the variant whose id begins with a text.
+    def find_folder(self, word: str) -> Path:
+        """Return the folder of the cell or the variant that a word names.
 
         Args:
-            beginning: The id, or so much of it that it is that of one cell or variant.
+            word: As for `find_cell`, or the same of a variant.
 
         Raises:
-            StoreError: There is no store, no id begins with it, or several do.
+            StoreError: There is no store, the word names no cell or variant, or it names several.
         """
+        if any((user_path(word) / name).is_file() for name in (IDENTITY, MANIFEST)):
+            return user_path(word)
         self.check_exists()
         variants = filter(variant_folders.is_variant, list_folder(self.variants))
         folders = {name: self.variant(name) for name in variants}
         folders |= {cell.id: cell.path for cell in self.cell_folders()}
-        return folders[listing.full_id(beginning, list(folders), "cells or variants")]
+        return folders[self._full_id(word, list(folders), "cells or variants")]
+
+    def find_sweep(self, word: str) -> str:
+        """Return the id of the sweep that a word names; of a scene, that of its latest sweep.
+
+        Args:
+            word: The sweep's id, or so much of it that it is that of one sweep; or the name of a
+                scene, or a path to its folder.
+
+        Raises:
+            StoreError: There is no store, or the word names no sweep, or several.
+        """
+        self.check_exists()
+        records, name = self._records_or_warnings(), _name_of(word)
+        of_scene = [i for i, r in records.items() if any(row.scene == name for row in r.cells)]
+        latest = {of_scene[-1]: name} if of_scene else {}
+        return listing.full_id(name, self.sweep_ids(), "sweeps", latest)
+
+    def _full_id(self, word: str, ids: Sequence[str], kinds: str) -> str:
+        """Return the one id that a word names."""
+        name = _name_of(word)
+        of_scene = {
+            cell_id: row.label
+            for cell_id, row in self.cell_names().items()
+            if row.scene == name and self.cell(cell_id).state(verify=False).name == "done"
+        }
+        return listing.full_id(name, ids, kinds, of_scene)
 
     def cell_folders(self) -> list[CellFolder]:
         """Return the cells, sorted by id; folders of earlier attempts, whose names have a dot, not.
@@ -432,6 +473,11 @@ class Store:
         if digest(msgspec.to_builtins(record.cells)) != record.digest:
             file = self.sweeps / f"{sweep_id}.json"
             raise StoreError(f"{file}: its cells have changed since it was written")
+
+
+def _name_of(word: str) -> str:
+    """Return the name of the scene where a word is a folder, and else the word."""
+    return scene_name(user_path(word)) if user_path(word).is_dir() else word
 
 
 def _asked_for(row: dict[str, Any]) -> dict[str, Any]:

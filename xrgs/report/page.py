@@ -21,7 +21,7 @@ from xrgs.report.external import with_external
 from xrgs.report.html import write_document
 from xrgs.report.joined import Choice, JoinedStore, report_name
 from xrgs.report.markup import LATEX_PREAMBLE, to_latex, to_markdown
-from xrgs.report.paper import paper_tables, texture_tables, with_texture
+from xrgs.report.paper import paper_tables, texture_tables, why_no_table, with_texture
 from xrgs.report.photographs import photographs, with_variants
 from xrgs.report.pictures import Picture, draw
 from xrgs.report.tables import Tables
@@ -63,7 +63,7 @@ class Report:
     """A report that `build` has written."""
 
     text: str
-    """The tables for a terminal, with the folder's name at the end."""
+    """The tables for a terminal, with the path of the page at the end."""
     folder: Path
     """The folder that it was written to."""
     files: tuple[Path, ...]
@@ -167,7 +167,7 @@ def build(
             " name another folder with --out"
         ) from error
     written = {p.file for p in drawn if p.file} | {folder / name for name in _FILES}
-    text = f"{_text(tables, _warnings(sweep))}\n{for_line(f'Written to {folder}')}"
+    text = f"{_text(tables, _warnings(sweep))}\n{for_line(f'Page: {folder / PAGE}')}"
     return Report(text=text, folder=folder, files=tuple(sorted(written)))
 
 
@@ -214,7 +214,7 @@ def _write(
     write_text(folder / "table.md", page)
     write_text(folder / "table.csv", _csv(tables.long()))
     write_document(
-        folder / "report.html",
+        folder / PAGE,
         store,
         sweep,
         tables,
@@ -226,9 +226,11 @@ def _write(
     return drawn
 
 
+#: The page of a report.
+PAGE = "report.html"
 #: The files of every report, beside its pictures.
 _FILES = (
-    "report.html",
+    PAGE,
     "table.md",
     "table.tex",
     "table.csv",
@@ -357,6 +359,8 @@ def _warnings(sweep: Sweep) -> list[str]:
     if unknown:
         warnings.append(f"{counted(unknown, 'cell')} can't be read now: run the report again.")
     warnings += _stale_warning(sweep)
+    if why := why_no_table(sweep.cells["label"], sweep.cells["scene"]):
+        warnings.append(why)
     shares = sorted({share for share in sweep.cells["validation"].dropna() if share > 0})
     if shares:
         listed = ", ".join(f"train.validation={share:g}" for share in shares)

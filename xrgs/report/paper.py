@@ -34,7 +34,7 @@ from xrgs.report.writing import (
     signed,
 )
 from xrgs.runtime.progress import progress
-from xrgs.runtime.text import TextTable
+from xrgs.runtime.text import TextTable, listed
 from xrgs.safeio.sanitize import counted
 
 if TYPE_CHECKING:
@@ -109,6 +109,23 @@ _NOT_COMPARABLE = {
     "memory_bytes": "the paper probably has gsplat's number, which is what torch allocates on the"
     " GPU, without the photographs; here every tensor that training holds is counted"
 }
+
+
+def why_no_table(labels: Iterable[str], scenes: Iterable[str]) -> str:
+    """Say why a sweep of full XR-GS has no table beside Table 1; empty where it has, or none of it.
+
+    Args:
+        labels: The labels of the sweep's cells.
+        scenes: The names of its scenes.
+    """
+    own = sorted({*scenes})
+    others, of_llff = [s for s in own if s not in _LLFF], [s for s in own if s in _LLFF]
+    if not (others and of_llff) or {*labels}.isdisjoint(_READINGS):
+        return ""
+    return (
+        f"No table is beside the paper's Table 1, since the means have scenes outside it:"
+        f" {listed(others)}. `xrgs-report --scenes {' '.join(of_llff)}` makes one."
+    )
 
 
 def paper_tables(comparison: Comparison, contexts: Mapping[str, Context]) -> list[TextTable]:

@@ -42,6 +42,9 @@ if TYPE_CHECKING:
     from xrgs.experiment.cell_folder import CellFolder
     from xrgs.experiment.store import Store
 
+#: Gaussians of a cell for each pixel of its largest view, mean over the steps, where no finished
+#: cell tells.
+GAUSSIANS_OF_A_PIXEL = 0.5
 #: Number of finished cells that are read, the newest first; more would take long and help little.
 _MAX_CELLS = 500
 #: How many times longer the torch backend takes for a training step than the native one: rendering
@@ -236,7 +239,7 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, st
 
 
 @cache
-def _views(variants: Path, variant_id: str) -> tuple[ViewEntry, ...]:
+def read_views(variants: Path, variant_id: str) -> tuple[ViewEntry, ...]:
     """Return the list of a variant's views, trimmed or not.
 
     Raises:
@@ -254,7 +257,7 @@ def _sizes(variants: Path, variant_id: str, conf: Conf) -> _Sizes:
     Raises:
         StoreError: The variant's list of views can't be read, or has none that is trained on.
     """
-    views = _views(variants, variant_id)
+    views = read_views(variants, variant_id)
     tag = {"hr_only": "HR", "lr_only": "LR"}.get(conf.train.views)
     # Originals take the place of degraded views.
     splits = ("train", "original") if conf.train.views == "all_hr" else ("train",)
@@ -272,6 +275,16 @@ def _sizes(variants: Path, variant_id: str, conf: Conf) -> _Sizes:
     moments = min(KEPT_BYTES, 2 * _FLOAT_RGB_BYTES * sum(pixels))  # mean and variance
     held = _RGB_BYTES * (sum(pixels) + tested) + moments
     return _Sizes(_rendered(training, conf), max(pixels), held)
+
+
+def units_of_a_step(store: Store, conf: Conf, variant_id: str) -> float:
+    """Return the rendered pixels and the Gaussians of a step of a cell, mean over the steps.
+
+    Raises:
+        StoreError: The variant's list of views can't be read.
+    """
+    sizes = _sizes(store.variants, variant_id, conf)
+    return sizes.pixels + GAUSSIANS_OF_A_PIXEL * sizes.largest
 
 
 def _rendered(views: Sequence[ViewEntry], conf: Conf) -> float:

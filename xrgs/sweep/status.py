@@ -140,6 +140,8 @@ def describe(status: StoreStatus) -> str:
     variants, sweeps = len(status.variants), status.sweeps
     lines.append(f"  {counted(variants, 'variant')}, {counted(sweeps, 'sweep')} recorded")
     lines += [_disk(status.sizes), *_table(status.cells)]
+    done = sorted((c for c in status.cells if c.state.name == "done"), key=lambda c: c.age_s or 0)
+    lines += _named("done, the latest first:", [cell.name for cell in done], "xrgs-store list")
     for state in ("running", "failed", "corrupt", "unknown", "unfinished"):
         of_state = [cell for cell in status.cells if cell.state.name == state]
         lines += _named(f"{state}:", [_reason(cell) for cell in of_state])
@@ -184,11 +186,18 @@ def _first_line(text: str) -> str:
     return text.partition("\n")[0]
 
 
-def _named(heading: str, names: Sequence[str]) -> list[str]:
-    """Return a heading with the first names below it; nothing where there are none."""
+def _named(heading: str, names: Sequence[str], command: str = "") -> list[str]:
+    """Return a heading with the first names below it; nothing where there are none.
+
+    Args:
+        heading: The line above.
+        names: The names.
+        command: What lists all of them.
+    """
     if not names:
         return []
-    more = [f"  and {len(names) - _MAX_NAMED} more"] if len(names) > _MAX_NAMED else []
+    left = len(names) - _MAX_NAMED
+    more = [f"  and {left} more{command and f': {command} has all'}"] if left > 0 else []
     return ["", heading, *(f"  {name}" for name in names[:_MAX_NAMED]), *more]
 
 

@@ -39,6 +39,7 @@ from xrgs.safeio.sanitize import for_line
 from xrgs.splat.settings import SSIM_WINDOW
 from xrgs.sweep import controls, launch, track, variants
 from xrgs.sweep.axes import CellSpec, effective, expand
+from xrgs.sweep.ending import ending
 from xrgs.sweep.estimate import CostEstimator
 from xrgs.sweep.jobs import worker
 from xrgs.sweep.jobs.job import FAIL_FAST, LOCKED, UNWRITABLE
@@ -78,14 +79,23 @@ _UNKNOWN_LOOKS = 5
 class Study:
     """One call of `xrgs-sweep`."""
 
-    def __init__(self, context: HydraContext, task: TaskFunction, config: DictConfig) -> None:
+    def __init__(
+        self,
+        context: HydraContext,
+        task: TaskFunction,
+        config: DictConfig,
+        *,
+        brief: bool = False,
+    ) -> None:
         """Keep what Hydra gives its sweeper.
 
         Args:
             context: Hydra's context of this call.
             task: The function that Hydra's launcher calls for each job.
             config: The config composed from the command line, with its `hydra` node.
+            brief: Print only progress and failures, no plan, notes and tables.
         """
+        self._brief = brief
         self._context = context
         self._task = task
         self._config = config
@@ -148,11 +158,9 @@ class Study:
         plan = self._identified(plan, store)
         past = CostEstimator(store)
         plan = estimated(plan, past, self._threads(len(plan)))
-        say(describe(plan), sys.stderr)
-        remarks = (*controls.mixed_prune_rules(plan), *unchanged(plan), without_kernels(plan))
-        for line in filter(None, (*remarks, expected_use(plan, past.known))):
-            log_line(line)
-        if any(left_to_train(plan)):
+        if not self._brief:
+            self._say_plan(plan, past.known)
+        if any(left_to_train(plan)) and (plan[0].conf.lpips.fetch or not self._brief):
             provide_lpips(fetch=plan[0].conf.lpips.fetch, dry_run=dry_run)
         if dry_run:
             return not will_fail(plan)
@@ -166,8 +174,21 @@ class Study:
             store.write_sweep(arguments, record(plan), sweep_id)
             from xrgs.report import build
 
-            say(build(store.path, sweep_id).text)
-        return all(cell.error is None and cell.state.name == "done" for cell in plan)
+            report = build(store.path, sweep_id)
+            if not self._brief:
+                say(f"{report.text}\n\n{ending(plan, store.path)}".rstrip())
+        complete = all(cell.error is None and cell.state.name == "done" for cell in plan)
+        if self._brief and not complete:
+            say(describe(plan), sys.stderr)
+        return complete
+
+    @staticmethod
+    def _say_plan(plan: Sequence[PlannedCell], past: int) -> None:
+        """Say what the sweep will do, with estimates from `past` finished cells."""
+        say(describe(plan), sys.stderr)
+        remarks = (*controls.mixed_prune_rules(plan), *unchanged(plan), without_kernels(plan))
+        for line in filter(None, (*remarks, expected_use(plan, past))):
+            log_line(line)
 
     def _threads(self, cells: int) -> int:
         """Return the threads of a cell whose config sets no number of threads."""
@@ -318,7 +339,7 @@ class Study:
                 )
             )
             said |= dict.fromkeys(f"{scenes.label(cell.conf.scene)}: {n}" for n in found.notes)
-        for line in said:
+        for line in () if self._brief else said:
             log_line(line)
         return cells
 

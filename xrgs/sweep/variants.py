@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from xrgs.capture import photographs, scenes, split, variant
+from xrgs.capture.degradations import DEGRADATIONS, resolve_degradation
 from xrgs.capture.description import read_report
 from xrgs.capture.folders import failed_folder, trimmed_folder
 from xrgs.config import CONF_DIR
@@ -20,13 +21,14 @@ from xrgs.experiment.store import StoreGoneError
 from xrgs.runtime.machine import usable_cores, usable_memory
 from xrgs.runtime.progress import log_line
 from xrgs.safeio.files import is_transient
+from xrgs.safeio.sanitize import counted
 from xrgs.sweep.jobs import worker
 from xrgs.sweep.jobs.supervise import Limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from xrgs.config import Conf, SceneConf
+    from xrgs.config import Conf, SceneConf, VariantConf
     from xrgs.experiment.store import Store
 
 _Result = TypeVar("_Result")
@@ -77,7 +79,10 @@ def _build(
     An exception that `check` raises meanwhile ends the child.
     """
     _check_held_out(scenes.names(conf.scene, conf.variant.long_side), conf)  # SfM takes minutes
-    log_line(f"{scenes.label(conf.scene)}: building the mixed-resolution variant{place}")
+    work = "building the mixed-resolution variant"
+    if resolve_degradation(conf.variant) == "none":
+        work = "finding the cameras" if conf.variant.poses is None else "reading the cameras"
+    log_line(f"{scenes.label(conf.scene)}: {work}{place}")
     request = {"conf": asdict(conf), "store": str(store.path)}
     answer = worker.run_in_child("variant", request, Limits(), lambda _: check(), environment)
     return str(answer["variant"])
@@ -113,6 +118,9 @@ def how_to_get(scenes: Iterable[SceneConf]) -> str:
         path = Path(scene.path or "")
         if path.name == scene.name and not path.exists():
             absent[scene.name] = path
+    near = {name: found for name, path in absent.items() if (found := _root_near(path))}
+    hints = [f"{root}/{name} is there: data_root={root}" for name, root in near.items()]
+    absent = {name: path for name, path in absent.items() if name not in near}
     missing: dict[tuple[str, Path], list[str]] = {}
     for file in sorted((CONF_DIR / "data").glob("*.yaml")):
         published = OmegaConf.load(file).scenes
@@ -125,7 +133,7 @@ def how_to_get(scenes: Iterable[SceneConf]) -> str:
         + ("" if root == usual else f" --data-root {shlex.quote(str(root))}")
         for (dataset, root), names in missing.items()
     ]
-    hints = [f"to download what is missing: {'; '.join(commands)}"] if commands else []
+    hints += [f"to download what is missing: {'; '.join(commands)}"] if commands else []
     captures = {file.stem for file in (CONF_DIR / "scene/captures").glob("*.yaml")}
     if own := [str(path) for name, path in absent.items() if name in captures]:
         hints.append(
@@ -133,6 +141,14 @@ def how_to_get(scenes: Iterable[SceneConf]) -> str:
             f" (section Scenes); they belong into {', '.join(own)}"
         )
     return "\n".join(hints)
+
+
+def _root_near(missing: Path) -> str:
+    """Return the right `data_root`, a level below or above a wrong one; empty if there is none."""
+    root, name = missing.parent, missing.name
+    found = [folder.parent for folder in sorted(root.glob(f"*/{name}")) if folder.is_dir()]
+    found += [root.parent] if root.name == name and root.is_dir() else []
+    return shlex.quote(str(found[0])) if found else ""
 
 
 def find_or_build(conf: Conf, store: Store) -> str:
@@ -322,7 +338,21 @@ def _expected_notes(conf: Conf, store: Store) -> tuple[str, ...]:
         notes = [*scene.notes, *photos.notes]
     _check_held_out(names, conf, notes)
     parts = split.split_before_sfm(names, sizes, conf.variant)
+    if conf.scene.kind == "folder":
+        notes.append(_what_becomes_of_them(parts, conf.variant))
     return *notes, *split.split_notes(parts, conf.variant)
+
+
+def _what_becomes_of_them(parts: split.Split, conf: VariantConf) -> str:
+    """Say how many photographs are held out, trained on, and degraded."""
+    trained, tests, way = len(parts.hr) + len(parts.lr), len(parts.test), resolve_degradation(conf)
+    said = f"{counted(trained + tests, 'photograph')}: {tests} held out, {trained} to train on"
+    if way == "none" or not parts.lr:
+        return f"{said}, as they are"
+    smaller = way in DEGRADATIONS and DEGRADATIONS[way].smaller
+    made = f"made {conf.factor} times smaller" if smaller else f"degraded by {way}"
+    lr = f"{len(parts.lr)} of which are {made}"
+    return f"{said}, {lr}; variant.hr_fraction=1 leaves them as they are"
 
 
 def _check_held_out(names: Sequence[str], conf: Conf, notes: Iterable[str] = ()) -> None:
@@ -338,15 +368,13 @@ def _check_held_out(names: Sequence[str], conf: Conf, notes: Iterable[str] = ())
         XrgsError: There are too few; the message says what helps.
     """
     parts = split.split_views(names, conf.variant)
-    lacking = split.shortage(parts, set(range(len(names))), conf.variant)
-    if not lacking:
+    if not split.shortage(parts, set(range(len(names))), conf.variant):
         return
-    held_out = len(parts.test)
-    which = f"{held_out} of {len(names)} photographs {'is' if held_out == 1 else 'are'} held out"
-    helps = "variant.test_every=0 (tests are then on the training views)"
+    held_out, left = len(parts.test), len(parts.hr) + len(parts.lr)
+    which = f"{held_out} {'is' if held_out == 1 else 'are'} held out to test on"
+    why = f"{which}, and {left} left to train on, which takes two"
+    helps = "hold none out: variant.test_every=0, or xrgs-train --all"
     if conf.variant.test:
         helps = "name fewer or others in variant.test"
-    where = f"scene {scenes.label(conf.scene)}"
-    raise XrgsError(
-        "; ".join([f"{where}: {lacking}. {which}: {helps}, or add photographs", *notes])
-    )
+    few = f"scene {scenes.label(conf.scene)}: {counted(len(names), 'photograph')} are too few"
+    raise XrgsError("; ".join([f"{few}: {why}. Add photographs, or {helps}", *notes]))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,7 +11,7 @@ import numpy as np
 from xrgs.errors import StoreError, XrgsError
 from xrgs.safeio.paths import user_path
 from xrgs.safeio.sanitize import for_line
-from xrgs.splat.files import load_gaussians
+from xrgs.splat.files import READERS, load_gaussians
 from xrgs.splat.settings import RasterSettings
 from xrgs.viewer.paths import Poses
 
@@ -64,8 +63,8 @@ def load_models(words: Sequence[str], store: Store, antialiased: bool | None = N
     """Load one model, or two of one world.
 
     Args:
-        words: The cells, each as its id, the beginning of its id that no other cell shares, or the
-            path of a .ply, .glb or .spz file.
+        words: The cells, each as `Store.find_cell` takes it, or as the path of a .ply, .glb or
+            .spz file.
         store: The store that has the cells.
         antialiased: Whether to render antialiased; None renders each as it was trained. Where a
             model says otherwise, a warning names it.
@@ -95,10 +94,10 @@ def reference(models: Sequence[Model]) -> Model | None:
 
 
 def find_cell(word: str, store: Store) -> CellFolder:
-    """Find a finished cell by its id, or by a beginning that no other cell's id has.
+    """Find a finished cell, see `Store.find_cell`.
 
     Raises:
-        StoreError: There is no such store or cell, several ids begin so, or it is not finished.
+        StoreError: There is no such store or cell, there are several, or it is not finished.
     """
     cell = store.find_cell(word)
     state = cell.state(verify=False)
@@ -121,12 +120,17 @@ def _with(model: Model, antialiased: bool | None) -> Model:
 
 
 def _load(word: str, store: Store) -> Model:
-    if Path(word).suffix:  # ids have no dots
-        file = user_path(word)
+    file = user_path(word)
+    if file.suffix.lower() in READERS:
         gaussians, antialiased = load_gaussians(file)
         settings = RasterSettings(antialiased=antialiased)
         return Model(for_line(file.name, _MAX_NAME), gaussians, settings)
-    cell = find_cell(word, store)
+    try:
+        cell = find_cell(word, store)
+    except StoreError:
+        if file.suffix:  # of another format: the message says which are read
+            load_gaussians(file)
+        raise
     data = cell.dataset()
     train = [PosedView(view.name, view.tag, view.camera) for view in data.train]
     test = [PosedView(view.name, "test", view.camera) for view in data.test]

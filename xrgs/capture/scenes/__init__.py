@@ -6,6 +6,7 @@ Nothing here imports torch before an embedded scene is rendered.
 from __future__ import annotations
 
 import hashlib
+import shlex
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -34,6 +35,8 @@ KINDS: dict[str, SceneKind] = {
     "folder": FolderScene(),
     "video": VideoScene(),
 }
+#: Kinds whose photographs are in this package, or are rendered by it.
+_EMBEDDED = ("procedural", "motorcycle")
 #: The values of `scene.alpha`; the first changes no fingerprint.
 ALPHA = ("composite", "mask")
 
@@ -122,4 +125,10 @@ def _masks(conf: SceneConf, long_side: int) -> tuple[dict[str, Path], tuple[str,
 def _kind(conf: SceneConf) -> SceneKind:
     if conf.kind not in KINDS:
         raise XrgsError(f"scene.kind={conf.kind}: must be one of {', '.join(KINDS)}")
+    if conf.path is not None and conf.kind in _EMBEDDED:
+        word = shlex.quote(f"scene.path={conf.path}")
+        raise XrgsError(
+            f"scene.path={conf.path}: the embedded scene {conf.kind} has no path; for photographs"
+            f" write scene=folder {word}, and for a video scene=video {word}"
+        )
     return KINDS[conf.kind]

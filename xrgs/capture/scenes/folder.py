@@ -43,7 +43,8 @@ _OTHER_IMAGES = frozenset(
     {".3fr", ".arw", ".cr2", ".cr3", ".dng", ".nef", ".nrw", ".orf", ".pef", ".raf", ".rw2"}
     | {".srw", ".x3f", ".avif", ".exr", ".gif", ".hdr", ".insp", ".jfif", ".jp2", ".jxl", ".psd"}
 )
-_VIDEOS = frozenset({".3gp", ".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpg", ".mts", ".webm"})
+#: Suffixes of videos.
+VIDEOS = frozenset({".3gp", ".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpg", ".mts", ".webm"})
 #: What programs make around photographs, by the entries of the folder that tell it.
 _MADE = {
     "a store of xrgs": ("cells", "variants"),
@@ -378,7 +379,7 @@ def _not_read(folders: Iterable[Path], taken: Sequence[Path]) -> list[str]:
     shown = {file.with_suffix("") for file in taken}
     videos, others, irregular = (
         [file for folder in sorted(folders) for file in _with_suffix(folder, suffixes)]
-        for suffixes in (_VIDEOS, _OTHER_IMAGES, images.SUFFIXES)
+        for suffixes in (VIDEOS, _OTHER_IMAGES, images.SUFFIXES)
     )
     lines = []
     if alone := [file for file in videos if file.with_suffix("") not in shown]:

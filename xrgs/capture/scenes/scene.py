@@ -105,9 +105,14 @@ def label(conf: SceneConf) -> str:
     """
     name = conf.name
     if not name and conf.path:
-        path = user_path(conf.path.removesuffix(ALL_BELOW)).resolve()
-        name = path.parent.name if path.name == "images" else path.name
+        name = scene_name(user_path(conf.path.removesuffix(ALL_BELOW)))
     return for_line(name, 200).strip() or conf.kind
+
+
+def scene_name(path: Path) -> str:
+    """Return the name that a folder or a video gives its scene, see `label`."""
+    path = path.resolve()
+    return path.parent.name if path.name == "images" else path.name
 
 
 def check_views(conf: SceneConf) -> None:

@@ -1,0 +1,228 @@
+"""Tests of `xrgs-train`: what it chooses and says, and one scene that is really made."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from xrgs.capture.description import ALIKE_RECIPE, MIXTURE_RECIPE, Mixture, SfmReport
+from xrgs.capture.scenes import motorcycle
+from xrgs.cli import budget, sweep, train
+from xrgs.experiment.cell_folder import CellFolder
+from xrgs.experiment.store import Store
+
+RunCommand = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def handed_over(
+    call_command: RunCommand, monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., dict[str, str]]:
+    """(mixture, *arguments) -> the overrides that a sweep gets, once the photographs are placed."""
+
+    def run(mixture: Mixture, *arguments: str) -> dict[str, str]:
+        words: list[str] = []
+        found = train._Found("0123-4567", mixture, SfmReport())
+        monkeypatch.setattr(train, "_look", lambda _: found)
+        monkeypatch.setattr(train, "_measured_unit", lambda _: 1e-7)
+        monkeypatch.setattr(train, "_units_of_a_step", lambda *_: 1e5)
+        monkeypatch.setattr(train, "_say_end", lambda *_: None)
+        monkeypatch.setattr(train, "_cell", lambda *_: CellFolder(Path("absent")))
+        monkeypatch.setattr(sweep, "run", lambda _, of, __: words.extend(of))
+        code, _, err = call_command("train", *arguments)
+        assert code == 0, err
+        return {key.lstrip("+"): value for key, _, value in (w.partition("=") for w in words)}
+
+    return run
+
+
+@pytest.fixture
+def garden(photographs: Callable[..., Path], tmp_path: Path) -> Path:
+    """A folder with nine photographs, in the folder in which commands run."""
+    return photographs(tmp_path / "garden", 9)
+
+
+@pytest.mark.usefixtures("garden")
+def test_the_recipe_is_for_what_the_photographs_are(
+    handed_over: Callable[..., dict[str, str]],
+) -> None:
+    mixed = handed_over(Mixture(coarse=3, views=8), "garden")
+    assert mixed["ablation"] == MIXTURE_RECIPE
+    assert handed_over(Mixture(coarse=1, views=8), "garden")["ablation"] == ALIKE_RECIPE
+    assert (mixed["scene.path"], mixed["baseline"], mixed["preset"]) == (
+        "garden",
+        "false",
+        "laptop",
+    )
+    assert (mixed["variant"], mixed["variant.factor"]) == ("sampling_rate", "1")  # as they are
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["--recipe", "lean"], {"ablation": "lean"}),
+        (["--recipe", "plus,exposure"], {"ablation": "[plus,exposure]"}),
+        (["--quality", "high"], {"preset": "paper", "train.evaluate_every": "0"}),
+        ([], {"preset": "laptop", "splat.densify.every": "500"}),  # as preset=laptop has it
+        (["--quality=draft"], {"train.steps": "1000", "variant.long_side": "336"}),
+        (["train.steps=100"], {"splat.densify.every": "15000"}),
+        (["train.steps=100", "splat.densify.every=7"], {"splat.densify.every": "7"}),
+        (["--size", "250"], {"variant.long_side": "250"}),
+        (["size=250", "--quality", "draft"], {"variant.long_side": "250", "train.steps": "1000"}),
+        (["--all"], {"variant.test_every": "0"}),
+        (["all=true"], {"variant.test_every": "0"}),
+        (["--masks", "m"], {"scene.masks": "m"}),
+        (["train.steps=7", "seed=3"], {"train.steps": "7", "seed": "3"}),
+        (["preset=paper", "store=other"], {"preset": "paper", "store": "other"}),
+        (["+ablation=mcmc"], {"ablation": "mcmc"}),
+        (["--store", "other", "variant.factor=2"], {"store": "other", "variant.factor": "2"}),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+@pytest.mark.usefixtures("garden")
+def test_options_are_overrides_and_those_of_the_user_win(
+    handed_over: Callable[..., dict[str, str]], arguments: list[str], expected: dict[str, str]
+) -> None:
+    words = handed_over(Mixture(0, 8), "garden", *arguments)
+    assert expected.items() <= words.items()
+
+
+@pytest.mark.usefixtures("garden")
+def test_a_long_run_is_refined_as_the_paper_s(
+    handed_over: Callable[..., dict[str, str]],
+) -> None:
+    words = handed_over(Mixture(0, 8), "garden", "--quality", "high")
+    assert "splat.densify.every" not in words
+
+
+@pytest.mark.usefixtures("garden")
+def test_gsplat_s_own_training_is_a_recipe_too(
+    handed_over: Callable[..., dict[str, str]],
+) -> None:
+    words = handed_over(Mixture(0, 8), "garden", "--recipe", "baseline")
+    assert not {"ablation", "baseline"} & words.keys()
+
+
+@pytest.mark.usefixtures("garden")
+def test_minutes_choose_size_and_steps_which_the_user_may_replace(
+    handed_over: Callable[..., dict[str, str]],
+) -> None:
+    words = handed_over(Mixture(0, 8), "garden", "--minutes", "10")
+    # 1e5 pixels and Gaussians a step take 10 ms; 600 s are for more than the most steps.
+    assert (words["train.steps"], words["preset"]) == ("30000", "paper")
+    words = handed_over(Mixture(0, 8), "garden", "--minutes", "1")
+    assert 3000 < int(words["train.steps"]) < 6000
+    assert words["preset"] == "laptop"
+    fixed = handed_over(Mixture(0, 8), "garden", "--minutes", "10", "train.steps=5", "--size", "99")
+    assert (fixed["train.steps"], fixed["variant.long_side"]) == ("5", "99")
+
+
+def test_more_time_gives_larger_views_and_more_steps_and_never_exceeds_the_time() -> None:
+    for unit in (1e-8, 1e-7, 1e-6):
+        sizes = [budget.size_for(60.0 * minutes, unit) for minutes in (1, 5, 20, 60, 600)]
+        assert sizes == sorted(sizes)
+    steps = [budget.steps_for(seconds, 0.05) for seconds in (60, 300, 1200)]
+    assert steps == sorted(steps)
+    for seconds, count in zip((60, 300, 1200), steps, strict=True):
+        assert 0.7 * seconds - 15 < 0.05 * count < seconds
+    assert budget.steps_for(1, 0.05) == 200  # too little time for anything: the fewest
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["gone"], "gone: there is no such folder or video"),
+        (["garden/0.png"], "garden/0.png: is a photograph; name the folder that it is in"),
+        (["a.zip"], "a.zip: is neither a folder of photographs nor a video"),
+        (["garden", "seed=0,1"], "seed=0,1: give one value; xrgs-sweep takes several"),
+        (["garden", "steps=5"], "steps: there is no such key; did you mean train.steps"),
+        (["garden", "--minutes", "0"], "--minutes 0: must be above 0"),
+        (["garden", "--minutes", "5", "--quality", "high"], "without --quality"),
+        (["garden", "--out", "a.obj"], "--out a.obj: a file ends with .ply, .glb, .spz"),
+        (["two"], "scene two: 2 photographs are too few: 1 is held out to test on"),
+        (["one"], "only 0.png in it; two or more are needed"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+@pytest.mark.usefixtures("garden")
+def test_what_cant_be_done_is_said_before_anything_is(
+    call_command: RunCommand,
+    photographs: Callable[..., Path],
+    tmp_path: Path,
+    arguments: list[str],
+    message: str,
+) -> None:
+    (tmp_path / "a.zip").touch()
+    photographs(tmp_path / "two", 2)
+    photographs(tmp_path / "one", 1)
+    code, _, err = call_command("train", *arguments)
+    assert code == 1
+    assert message in err
+    assert err.startswith("xrgs-train: ") or arguments == ["two"]
+    assert not list(tmp_path.glob("xrgs-store/cells/*"))
+
+
+@pytest.mark.usefixtures("garden")
+def test_a_dry_run_says_how_many_photographs_there_are_and_writes_nothing(
+    call_command: RunCommand, garden: Path, tmp_path: Path
+) -> None:
+    (garden / "damaged.png").write_bytes(b"no image")
+    code, out, err = call_command("train", "garden", "--dry-run")
+    assert code == 0, err
+    assert out.splitlines()[0] == "garden: 10 photographs found"
+    assert "left out: damaged.png" in out
+    assert "9 photographs: 2 held out, 7 to train on, as they are\n" in out
+    assert not (tmp_path / "xrgs-store").exists()
+
+
+@pytest.mark.slow
+def test_a_scene_is_made_and_its_last_lines_lead_on(
+    forked_command: RunCommand, tmp_path: Path
+) -> None:
+    folder = tmp_path / "my bike"
+    folder.mkdir()
+    for file in motorcycle.files().values():
+        shutil.copy(file, folder)
+    small = ("--size", "250", "train.steps=8", "variant.sfm.long_side=500")
+    code, out, err = forked_command("train", tmp_path, "my bike", "--all", *small)
+    assert code == 0, err
+    lines = out.splitlines()
+    assert lines[0] == "my bike: 2 photographs found"
+    end = lines[-8:]
+    assert end[0] == "my bike: 2 of 2 photographs are placed"
+    assert end[1].endswith(" dB on 2 photographs that it was trained on")
+    assert "Gaussians after 8 steps; all took " in end[2]
+    page = tmp_path / end[3].removeprefix("Page: ")
+    assert page.name == "report.html"
+    assert page.is_file()
+    assert end[4] == "Next:"
+    assert end[5] == "  xrgs-view 'my bike'"
+    assert end[7].startswith("  xrgs-data export 'my bike' --out ")
+    assert "plan:" not in err  # a study's words
+    (cell,) = Store(tmp_path / "xrgs-store").cell_folders()
+    splats = (cell.path / "splats.ply").read_bytes()
+
+    code, out, err = forked_command("train", tmp_path, "my bike", "--all", *small, "--out=a.ply")
+    assert code == 0, err  # found again, and exported by its name
+    assert "training" not in err + out
+    assert f"trained already by {ALIKE_RECIPE}: 8 steps at 250 px\n" in out
+    assert out.splitlines()[-1].endswith("written to a.ply")
+    assert forked_command("data", tmp_path, "export", "my bike", "--out", "b.ply")[0] == 0
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+
+    shutil.rmtree(tmp_path / "xrgs-store")
+    assert forked_command("train", tmp_path, "my bike", "--all", *small)[0] == 0
+    assert (cell.path / "splats.ply").read_bytes() == splats  # the same bits
+
+
+def test_a_cell_that_fails_is_named_with_the_reason(sweep_here: RunCommand, children: Any) -> None:
+    children.failures = {0: "it raised"}
+    arguments = ("scene=motorcycle", "preset=smoke", "store=s", "hydra.sweeper.brief=true")
+    code, out, err = sweep_here(*arguments)
+    assert (code, out) == (1, "")
+    assert re.search(r"^  failed .* motorcycle / .* / seed 0  \(it raised\)$", err, re.MULTILINE)

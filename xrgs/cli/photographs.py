@@ -1,0 +1,43 @@
+"""The overrides for photographs as they are, which several commands take by their folder."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from xrgs.capture.images import SUFFIXES
+from xrgs.capture.scenes.folder import VIDEOS
+from xrgs.capture.scenes.scene import ALL_BELOW
+from xrgs.errors import XrgsError
+from xrgs.safeio.paths import user_path
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+
+def as_they_are(given: str) -> list[str]:
+    """Return the overrides for a folder of photographs, or for a video, of which none is degraded.
+
+    What the photographs show tells how fine they are, and which are HR.
+
+    Args:
+        given: The folder, the folder with `/**`, or the video.
+
+    Raises:
+        XrgsError: There is neither of that name.
+    """
+    path = user_path(given.removesuffix(ALL_BELOW))
+    if path.suffix.lower() in SUFFIXES and not path.is_dir():
+        raise XrgsError(f"{given}: is a photograph; name the folder that it is in")
+    if not path.exists():
+        raise XrgsError(f"{given}: there is no such folder or video")
+    kind = "folder" if path.is_dir() else "video"
+    if kind == "video" and path.suffix.lower() not in VIDEOS:
+        raise XrgsError(f"{given}: is neither a folder of photographs nor a video")
+    # Nothing is cropped, and two photographs to train on are enough.
+    variant = ("variant=sampling_rate", "variant.factor=1", "variant.min_hr=1")
+    return [f"scene={kind}", f"scene.path={given}", *variant]
+
+
+def last_of_each_key(words: Iterable[str]) -> list[str]:
+    """Return overrides without those whose key a later one has, which Hydra refuses for groups."""
+    return list({word.lstrip("+").partition("=")[0]: word for word in words}.values())

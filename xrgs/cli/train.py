@@ -1,0 +1,309 @@
+"""`xrgs-train`: makes a scene of photographs, or of a video, as they are.
+
+It looks at the photographs, finds their cameras, chooses a recipe, and trains one cell by what
+`xrgs-sweep` calls. All that it decides are overrides of Hydra, and the user's own replace them.
+"""
+
+from __future__ import annotations
+
+import shlex
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from statistics import fmean
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from xrgs import composing
+from xrgs.capture import scenes
+from xrgs.cli import budget, options, sweep
+from xrgs.cli.data import form_of, write_export
+from xrgs.cli.hydra_words import check_no_axis, explained, with_quotes
+from xrgs.cli.options import STORE, Flag, Folder, OptionalFolder, shown_as
+from xrgs.cli.photographs import as_they_are, last_of_each_key
+from xrgs.errors import StoreError, XrgsError
+from xrgs.experiment.store import BASELINE, Store
+from xrgs.runtime.machine import set_passive_openmp_wait, usable_cores
+from xrgs.runtime.signals import exit_on_signal
+from xrgs.runtime.streams import say
+from xrgs.runtime.text import format_duration
+from xrgs.safeio.sanitize import counted, for_line
+from xrgs.splat.settings import NOMINAL_STEPS
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from xrgs.capture.description import Mixture, SfmReport
+    from xrgs.config import Conf
+    from xrgs.experiment.cell_folder import CellFolder
+
+#: The overrides of each quality.
+_QUALITIES = {
+    "draft": ("preset=laptop", "variant.long_side=336", "train.steps=1000"),
+    "normal": ("preset=laptop",),
+    "high": ("preset=paper", "train.evaluate_every=0"),
+}
+#: Steps from which on a run has the settings of `preset=paper`; and the steps of a shorter run
+#: between two refinements, those of `preset=laptop`: with fewer, more grows than it can train.
+_LONG_RUN, _REFINED_EVERY = 10_000, 50
+#: How the notes on photographs begin that are for studies.
+_FOR_STUDIES = ("the split by variant.tags=", "sampling rates of training views differ by")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is made of which photographs."""
+
+    photographs: Positional[Annotated[str, arg(metavar="FOLDER|VIDEO")]]
+    """Folder of photographs of one place (FOLDER/** with all folders below), or a video."""
+    overrides: Positional[Annotated[tuple[str, ...], shown_as("KEY=VALUE ...")]] = ()
+    """Keys of xrgs-sweep, as train.steps=5000 or seed=1; they replace what is chosen."""
+    minutes: Annotated[float | None, shown_as("N")] = None
+    """Choose size and steps so that all takes about so long on this machine."""
+    quality: Literal["draft", "normal", "high"] = "normal"
+    """1,000 steps at 336 px; 3,000 at 504 px; or 30,000 at 1,008 px."""
+    size: Annotated[int | None, shown_as("PX")] = None
+    """Longer side of the photographs that are trained on; 0 keeps their size."""
+    recipe: Annotated[str | None, shown_as("NAME[,NAME]")] = None
+    """Ablations of xrgs-sweep, trained together; by default what suits the photographs."""
+    hold_none: Annotated[Flag, arg(name="all")] = False
+    """Train on all photographs; otherwise every eighth is held out, to tell the quality."""
+    masks: OptionalFolder = None
+    """Folder of the photographs' masks: white is used, black is not."""
+    out: Annotated[Path | None, shown_as("FILE|FOLDER")] = None
+    """Also write the scene: a .ply, .glb or .spz file, or a folder for other programs."""
+    dry_run: Flag = False
+    """Say which photographs there are, and stop."""
+    store: Folder = STORE
+    """Folder that keeps all that is made."""
+
+
+@dataclass
+class _Words:
+    """The arguments of `xrgs-sweep`; a later word replaces an earlier one of its key."""
+
+    given: Sequence[str]
+    """Those of the user, which replace all others."""
+    own: list[str] = field(default_factory=list)
+
+    @property
+    def all(self) -> list[str]:
+        """All of them."""
+        return last_of_each_key([*self.own, *self.given])
+
+    def value(self, key: str) -> str:
+        """Return the value of a key; empty where no word has it."""
+        values = (word.lstrip("+").partition("=") for word in self.all)
+        return next((value for name, _, value in values if name == key), "")
+
+    def compose(self) -> Conf:
+        """Return the config.
+
+        Raises:
+            XrgsError: A word is wrong, or gives several values.
+        """
+        with explained():
+            words = with_quotes(self.all)
+            check_no_axis(words)
+            return composing.compose(*words)
+
+
+def train(settings: Settings) -> None:
+    """Make a 3D scene of photographs: find the cameras, train, and write a page with the result.
+
+    Run again, it finds what is done. Then xrgs-view shows the scene, xrgs-render makes a film of
+    it, and xrgs-data export writes it for other programs.
+
+    Args:
+        settings: What is made of which photographs.
+    """
+    begin = time.monotonic()
+    if settings.minutes is not None and (settings.quality != "normal" or not settings.minutes > 0):
+        raise XrgsError(f"minutes={settings.minutes:g}: must be above 0, and without --quality")
+    if settings.out is not None:
+        form_of(settings.out)
+    words = _words(settings)
+    unit = _measured_unit(words.compose()) if settings.minutes else None
+    if settings.minutes and unit and settings.size is None:
+        words.own.append(f"variant.long_side={budget.size_for(60 * settings.minutes, unit)}")
+    with exit_on_signal("Run the same command again to continue."):
+        found = _look(words)
+        if found is None:
+            return
+        words.own += _recipe(settings.recipe or found.mixture.recipe)
+        if settings.minutes and unit:
+            left = 60 * settings.minutes - (time.monotonic() - begin)
+            _choose_steps(found, words, settings, unit, left)
+        steps = words.compose().train.steps
+        if steps < _LONG_RUN:
+            words.own.append(f"splat.densify.every={_REFINED_EVERY * NOMINAL_STEPS // steps}")
+        conf = words.compose()
+        recipe = words.value("ablation") or BASELINE
+        what = f"{recipe}: {conf.train.steps:,} steps at {conf.variant.long_side} px"
+        if _cell(found, conf).state(verify=False).name == "done":
+            _say(f"trained already by {what}")
+        else:
+            _say(f"training by {what}, {format_duration(_expected_s(found, conf, unit))}")
+    again = "the command above continues" if settings.minutes else "run it again to continue"
+    hint = f"What is done is kept: {again}."
+    sweep.run("xrgs-train", [*words.all, "hydra.sweeper.brief=true"], hint)
+    _say_end(found, conf, settings, time.monotonic() - begin)
+
+
+def _words(settings: Settings) -> _Words:
+    """Return the words that are known before the photographs are looked at."""
+    own = [*as_they_are(settings.photographs), f"store={settings.store}"]
+    own += ["retry=failed", "lpips.fetch=false", *_QUALITIES[settings.quality]]
+    own += [f"variant.long_side={settings.size}"] if settings.size is not None else []
+    own += ["variant.test_every=0"] if settings.hold_none else []
+    own += [f"scene.masks={settings.masks}"] if settings.masks else []
+    own += ["dry_run=true"] if settings.dry_run else []
+    return _Words(settings.overrides, own)
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What is known of the photographs, once their cameras are found."""
+
+    variant_id: str
+    mixture: Mixture
+    report: SfmReport
+
+
+def _look(words: _Words) -> _Found | None:
+    """Find the photographs and their cameras, and say so; None in a dry run, which trains nothing.
+
+    Raises:
+        XrgsError: There are too few photographs, or too few are placed.
+    """
+    from xrgs.capture.description import mixture
+    from xrgs.report.joined import JoinedStore
+    from xrgs.sweep import variants
+    from xrgs.sweep.estimate import read_views
+
+    conf = words.compose()
+    store, name = Store(conf.store), scenes.label(conf.scene)
+    photographs = scenes.names(conf.scene, conf.variant.long_side)
+    kind = _kind(conf)
+    _say(f"{name}: {counted(len(photographs), kind)} found")
+    if not conf.dry_run:
+        store.prepare()
+    (planned,) = variants.plan([conf], store, allow_build=not conf.dry_run)
+    if planned.error or planned.unknown:
+        raise XrgsError(planned.error or f"{planned.unknown}; run the same command again")
+    for note in planned.notes:
+        if not note.startswith(_FOR_STUDIES):
+            _say(f"  {note}")
+    if planned.id is None:
+        _say("without --dry-run, their cameras are found, and a recipe is chosen for what they are")
+        return None
+    report = JoinedStore((store,)).variant_report(planned.id)
+    found = mixture(read_views(store.variants, planned.id))
+    _say(f"{name}: the cameras of {report.registered} of {report.images} {kind}s are found")
+    _say(
+        f"{name}: {'a mixture' if found.is_one else 'photographs alike'}: {found.coarse} of"
+        f" {found.views} to train on are 1.5 times or more as coarse as the finest"
+    )
+    return None if conf.dry_run else _Found(planned.id, found, report)
+
+
+def _recipe(names: str) -> list[str]:
+    """Return the words for a recipe: one ablation, several that are joined, or the baseline."""
+    if names == BASELINE:
+        return []
+    return [f"+ablation=[{names}]" if "," in names else f"+ablation={names}", "baseline=false"]
+
+
+def _measured_unit(conf: Conf) -> float:
+    """Measure how quickly this machine trains: seconds a step, for each pixel and Gaussian."""
+    set_passive_openmp_wait()  # before torch is loaded
+    from xrgs.bench.speed import seconds_per_unit
+
+    return seconds_per_unit(conf.threads or usable_cores(), conf.splat.backend)
+
+
+def _choose_steps(
+    found: _Found, words: _Words, settings: Settings, unit: float, left_s: float
+) -> None:
+    """Choose the steps for the time that is left, and say how to have the same ones again."""
+    conf = words.compose()
+    steps = budget.steps_for(left_s, unit * _units_of_a_step(found, conf))
+    quality = "high" if steps >= _LONG_RUN else "normal"
+    side = conf.variant.long_side
+    words.own += [*_QUALITIES[quality], f"variant.long_side={side}", f"train.steps={steps}"]
+    again = ["xrgs-train", settings.photographs, "--quality", quality, "--size", str(side)]
+    again += ["--recipe", settings.recipe] if settings.recipe else []
+    again += ["--all"] if settings.hold_none else []
+    again += ["--masks", str(settings.masks)] if settings.masks else []
+    again += ["--store", str(settings.store)] if settings.store != STORE else []
+    again += [f"train.steps={steps}", *settings.overrides]
+    _say(f"chosen for {settings.minutes:g} min; the same again, bit for bit: {shlex.join(again)}")
+
+
+def _expected_s(found: _Found, conf: Conf, unit: float | None) -> float:
+    """Return the expected seconds of a training, from finished cells or a measurement."""
+    from xrgs.sweep.estimate import CostEstimator
+
+    if unit is None:
+        threads = conf.threads or usable_cores()
+        cost = CostEstimator(Store(conf.store)).cost(conf, found.variant_id, threads)
+        if cost is not None:
+            return cost.seconds
+        unit = _measured_unit(conf)
+    return conf.train.steps * unit * _units_of_a_step(found, conf)
+
+
+def _units_of_a_step(found: _Found, conf: Conf) -> float:
+    from xrgs.sweep.estimate import units_of_a_step
+
+    return units_of_a_step(Store(conf.store), conf, found.variant_id)
+
+
+def _say_end(found: _Found, conf: Conf, settings: Settings, seconds: float) -> None:
+    """Say in at most eight lines what was made, where it is, and what comes next."""
+    from xrgs.report.page import PAGE
+    from xrgs.sweep.ending import next_commands
+
+    store, name = Store(conf.store), scenes.label(conf.scene)
+    cell = _cell(found, conf)
+    summary, report = cell.summary(), found.report
+    scores = [values["psnr"] for _, values in cell.view_scores()]
+    unseen = "that it had not seen" if report.tests else "that it was trained on"
+    took = f"{seconds / 60:.1f} min" + (f" of {settings.minutes:g} min" if settings.minutes else "")
+    (sweep_id,) = store.sweeps_of(cell.id)[-1:]
+    _say(f"{name}: {report.registered} of {report.images} {_kind(conf)}s are placed")
+    _say(f"{fmean(scores):.1f} dB on {counted(len(scores), _kind(conf))} {unseen}")
+    _say(f"{summary.gaussians:,} Gaussians after {summary.steps:,} steps; all took {took}")
+    _say(f"Page: {store.reports / sweep_id / PAGE}")
+    try:
+        word = name if store.find_cell(name).id == cell.id else cell.id
+    except StoreError:  # several cells of the scene are done
+        word = cell.id[:8]
+    say("Next:")
+    # Not the name of the video itself, which a film would replace.
+    file = f"{Path(name).stem}-scene" if conf.scene.kind == "video" else name
+    commands = next_commands([word], file, store.path)
+    if settings.out is not None:
+        commands[-1] = write_export(cell.path, settings.out)
+    for command in commands:
+        say(f"  {command}")
+
+
+def _cell(found: _Found, conf: Conf) -> CellFolder:
+    from xrgs.experiment.identity import cell_id, cell_identity
+
+    return Store(conf.store).cell(cell_id(cell_identity(conf, found.variant_id)))
+
+
+def _kind(conf: Conf) -> str:
+    return "frame" if conf.scene.kind == "video" else "photograph"
+
+
+def _say(line: str) -> None:
+    say(for_line(line))
+
+
+def main() -> None:
+    """Run `xrgs-train`."""
+    options.run("xrgs-train", train, overrides="xrgs-train")
