@@ -36,7 +36,7 @@ _SAME_ANGLE, _SAME_PLACE = 0.1, 0.01
 #: share of 0.45 (monstree), and no PSNR with 0.11 (reichstag).
 _MIXTURE_FROM = 0.25
 #: The recipe (a file of `conf/ablation/`) for a mixture, and the one for photographs alike.
-MIXTURE_RECIPE, ALIKE_RECIPE = "plus", "keep_large"
+MIXTURE_RECIPE, ALIKE_RECIPE = "plus", "tuned_baseline"
 
 
 class SfmAttempt(Struct):
