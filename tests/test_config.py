@@ -246,12 +246,12 @@ def test_every_path_may_begin_with_the_home_folder(
     compose: Compose, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("HOME", "/home/some one")
-    conf = compose(*(f"{key}=~/a b/c" for key in PATHS if key != "scene.path"))
+    conf = compose(*(f"{key}='~/a, b/c'" for key in PATHS if key != "scene.path"))
     paths = [conf.scene.masks, conf.variant.poses, conf.store, conf.data_root]
-    assert paths == ["/home/some one/a b/c"] * 4
-    assert compose("scene=folder", "scene.path=~/a/**").scene.path == "/home/some one/a/**"
-    assert compose("scene=llff/fern", "data_root=~/d").scene.path == "/home/some one/d/fern"
-    assert compose("store=~nobody/x").store == "~nobody/x"
+    assert paths == ["/home/some one/a, b/c"] * 4
+    assert compose("scene=folder", "scene.path='~/a/**'").scene.path == "/home/some one/a/**"
+    assert compose("scene=llff/fern", "data_root='~/d'").scene.path == "/home/some one/d/fern"
+    assert compose("store='~nobody/x'").store == "~nobody/x"
 
 
 def test_configs_are_composed_where_hydra_is_in_use_and_leave_it_as_it_was(

@@ -132,7 +132,7 @@ def _expand_home(conf: Conf) -> None:
 
 
 def _check_integers(values: dict[str, Any], path: str = "") -> None:
-    """Raise `XrgsError` for an integer that torch and JSON can't hold; the message names its key."""
+    """Raise `XrgsError` for an integer that torch can't hold; the message names its key."""
     for name, value in values.items():
         if isinstance(value, dict):
             _check_integers(value, f"{path}{name}.")

@@ -197,7 +197,7 @@ def test_an_axis_of_the_sweepers_own_settings_is_planned(sweep_here: RunCommand)
 
 
 def test_a_glob_is_every_file_of_its_group_of_that_name(sweep_here: RunCommand) -> None:
-    code, _, err = sweep_here("scene=motorcycle", "+ablation=glob(mip*)", "dry_run=true")
+    _, _, err = sweep_here("scene=motorcycle", "+ablation=glob(mip*)", "dry_run=true")
     assert "plan: 3 cells" in err
     assert "/ mip_off_late /" in err
 

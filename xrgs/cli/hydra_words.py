@@ -114,13 +114,14 @@ def _explained(error: Exception) -> str:
     if found := _NOT_OVERRIDDEN.search(str(error)):
         key = found[1].partition("@")[0]
         return f"{key}: there is no such key{did_you_mean(key, config.known_keys())}"
+    offered = ""
     if isinstance(error, (ConfigKeyError, ConfigAttributeError)):
         parent = error.parent_node
         known = tuple(map(str, parent)) if isinstance(parent, DictConfig) else ()
-        return composing.error_line(error) + did_you_mean(str(error.key), known)
-    if isinstance(error.__cause__, OmegaConfBaseException):  # it names the key and the value
+        offered = did_you_mean(str(error.key), known)
+    elif isinstance(error.__cause__, OmegaConfBaseException):  # it names the key and the value
         return _explained(error.__cause__)
-    return composing.error_line(error)
+    return composing.error_line(error) + offered
 
 
 def _wrong_file(file: str, error: BaseException) -> str:

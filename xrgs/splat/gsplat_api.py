@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 import torch
 from torch.nn.functional import pad
 
+from xrgs.runtime.torch_defaults import on_cpu_in_float32
 from xrgs.splat.cameras import Camera
 from xrgs.splat.rendering import backend_for, rasterize_parameters
 from xrgs.splat.settings import RasterSettings
@@ -51,6 +52,7 @@ class _Projections(NamedTuple):
     opacities: Tensor  # [C, N], compensated if antialiased
 
 
+@on_cpu_in_float32
 def rasterization(
     means: Tensor,
     quats: Tensor,

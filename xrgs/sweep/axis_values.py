@@ -49,7 +49,7 @@ def parsed(arguments: Sequence[str], loader: ConfigLoader | None = None) -> list
 
 
 def as_name(text: str) -> str:
-    """Return the name of a file of a group, in quotes if Hydra reads no text: `50`, `1e3`, `true`."""
+    """Return the name of a file, in quotes if Hydra reads no text from it: `50`, `1e3`, `true`."""
     (override,) = OverridesParser.create().parse_overrides([f"name={text}"])
     if not isinstance(override.value(), bool | int | float | None):
         return text

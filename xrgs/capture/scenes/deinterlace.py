@@ -31,8 +31,7 @@ def deinterlaced(frames: Iterable[VideoFrame]) -> Iterator[VideoFrame]:
     Frames of RGB stay as they are. The times of the others are changed.
     """
     for _, alike in groupby(frames, _layout):
-        warm_up = [*islice(alike, _WARM_UP)]
-        yield from chain(warm_up, alike) if warm_up[0].format.is_rgb else _filtered(warm_up, alike)
+        yield from _filtered(alike)
 
 
 def _layout(frame: VideoFrame) -> tuple[int, int, str, int, int]:
@@ -63,12 +62,16 @@ def _graph(warm_up: Sequence[VideoFrame]) -> Graph:
     return graph
 
 
-def _filtered(warm_up: Sequence[VideoFrame], others: Iterator[VideoFrame]) -> Iterator[VideoFrame]:
-    """Yield the frames as the filters leave them; those of the warm-up come first, and once."""
+def _filtered(frames: Iterator[VideoFrame]) -> Iterator[VideoFrame]:
+    """Yield frames of one layout as the filters leave them."""
     import av
 
+    warm_up = [*islice(frames, _WARM_UP)]
+    if warm_up[0].format.is_rgb:
+        yield from chain(warm_up, frames)
+        return
     graph = _graph(warm_up)
-    for time, frame in enumerate(chain(warm_up, warm_up, others, [None]), -len(warm_up)):
+    for time, frame in enumerate(chain(warm_up, warm_up, frames, [None]), -len(warm_up)):
         if frame is not None:
             frame.pts, frame.time_base = time, _TIME_BASE
         graph.vpush(frame)

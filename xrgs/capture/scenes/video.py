@@ -51,8 +51,8 @@ _SOURCES = (
     *("capture/colour.py", "capture/images.py"),
     *("capture/scenes/deinterlace.py", "capture/scenes/video.py"),
 )
-#: H.273's number of a matrix that is not named. From so many rows on players then take BT.709's, and
-#: BT.601's for smaller frames.
+#: H.273's number of a matrix that is not named, and the rows from which on players then take that
+#: of BT.709; for smaller frames they take that of BT.601.
 _UNKNOWN_MATRIX, _HD_ROWS = 2, 720
 
 
