@@ -251,7 +251,7 @@ def test_every_path_may_begin_with_the_home_folder(
     assert paths == ["/home/some one/a, b/c"] * 4
     assert compose("scene=folder", "scene.path='~/a/**'").scene.path == "/home/some one/a/**"
     assert compose("scene=llff/fern", "data_root='~/d'").scene.path == "/home/some one/d/fern"
-    assert compose("store='~nobody/x'").store == "~nobody/x"
+    assert compose("store='~no-such-user/x'").store == "~no-such-user/x"
 
 
 def test_configs_are_composed_where_hydra_is_in_use_and_leave_it_as_it_was(

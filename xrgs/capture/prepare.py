@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from xrgs.capture import dataset, variant
 from xrgs.capture.description import read_report
-from xrgs.runtime.torch_defaults import on_cpu_in_float32
+from xrgs.splat.torch_defaults import on_cpu_in_float32
 
 if TYPE_CHECKING:
     from xrgs.capture.dataset import Dataset

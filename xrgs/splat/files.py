@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from xrgs.errors import XrgsError
-from xrgs.runtime.torch_defaults import on_cpu_in_float32
 from xrgs.splat.glb import read_glb, write_glb
 from xrgs.splat.ply import read_ply, save_ply
 from xrgs.splat.saved import check_is_read
 from xrgs.splat.spz import read_spz, write_spz
+from xrgs.splat.torch_defaults import on_cpu_in_float32
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

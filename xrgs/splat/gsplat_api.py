@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 import torch
 from torch.nn.functional import pad
 
-from xrgs.runtime.torch_defaults import on_cpu_in_float32
 from xrgs.splat.cameras import Camera
 from xrgs.splat.rendering import backend_for, rasterize_parameters
 from xrgs.splat.settings import RasterSettings
 from xrgs.splat.sh import C0, MAX_DEGREE, bases
 from xrgs.splat.torch.projection import depths as camera_depths
 from xrgs.splat.torch.projection import project
+from xrgs.splat.torch_defaults import on_cpu_in_float32
 
 if TYPE_CHECKING:
     from torch import Tensor

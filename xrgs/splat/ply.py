@@ -15,7 +15,6 @@ import numpy as np
 import torch
 
 from xrgs.errors import XrgsError
-from xrgs.runtime.torch_defaults import on_cpu_in_float32
 from xrgs.safeio import ply
 from xrgs.safeio.atomic import atomic_writer
 from xrgs.splat.saved import (
@@ -28,6 +27,7 @@ from xrgs.splat.saved import (
     to_gaussians,
 )
 from xrgs.splat.sh import MAX_DEGREE, bases
+from xrgs.splat.torch_defaults import on_cpu_in_float32
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

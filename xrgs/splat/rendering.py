@@ -9,12 +9,12 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from xrgs.runtime.torch_defaults import on_cpu_in_float32
 from xrgs.splat.backend import DEVICES, implementation
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import ActivatedGaussians, Gaussians
 from xrgs.splat.settings import RasterSettings
 from xrgs.splat.sh import check_sh_degree
+from xrgs.splat.torch_defaults import on_cpu_in_float32
 
 #: Shape of one Gaussian's value; the shape of shN depends on the number of bands.
 _SHAPES: dict[str, tuple[int, ...]] = {

@@ -8,7 +8,6 @@ forgets that its values are shuffled. The functions here give what Hydra 1.4 giv
 
 from __future__ import annotations
 
-import builtins
 import itertools
 import math
 from collections.abc import Iterator
@@ -62,9 +61,9 @@ def _range(start: float, stop: float | None = None, step: float = 1) -> ChoiceSw
         start, stop = 0, start
     if step == 0:
         raise ValueError("the step of a range must not be 0")
+    if isinstance(start, int) and isinstance(stop, int) and isinstance(step, int):
+        return ChoiceSweep(list=[*range(start, stop, step)])
     numbers = (start, stop, step)
-    if all(isinstance(number, int) for number in numbers):
-        return ChoiceSweep(list=[*builtins.range(*numbers)])
     if not all(map(math.isfinite, numbers)):
         raise ValueError("the numbers of a range must be finite")
     return ChoiceSweep(list=[*map(float, _steps(*(Decimal(str(number)) for number in numbers)))])

@@ -17,7 +17,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from xrgs.errors import XrgsError
-from xrgs.runtime.torch_defaults import on_cpu_in_float32
+from xrgs.splat.torch_defaults import on_cpu_in_float32
 from xrgs.training.checkpoint import Checkpoint
 from xrgs.training.components.base import Component, Step, check_not_negative
 from xrgs.training.loop import train

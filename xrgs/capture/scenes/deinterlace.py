@@ -80,5 +80,5 @@ def _filtered(frames: Iterator[VideoFrame]) -> Iterator[VideoFrame]:
                 made = graph.vpull()
             except (av.BlockingIOError, av.EOFError):
                 break
-            if made.pts >= 0:
+            if made.pts is not None and made.pts >= 0:
                 yield made

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import pytest
 import torch
 
-from xrgs.runtime.torch_defaults import on_cpu_in_float32
+from xrgs.splat.torch_defaults import on_cpu_in_float32
 
 #: `meta` stands for any device: an operation on it and on the CPU's memory raises.
 PROGRAM = """
