@@ -59,10 +59,9 @@ _MAX_LISTED = 20
 _WHOLE = re.compile(r"\d+(?:\.\d*)?(?:[eE]\+?\d+)?|\d+\.0*")
 #: Keys whose values are lists of names.
 _NAMES = frozenset({"variant.test"})
-#: Hydra's options that take a value, and those among them whose value is a folder.
+#: Those whose value is a folder, and the one that needs no value.
 _FOLDERS = frozenset({"--config-dir", "-cd", "--config-path", "-cp"})
-_WITH_VALUE = _FOLDERS | {"--config-name", "-cn", "--package", "-p", "--cfg", "-c"}
-_INFO = ("--info", "-i")
+_INFO = frozenset({"--info", "-i"})
 #: What asks Hydra for something else than a sweep.
 _OTHER_MODES = frozenset(
     (
@@ -169,7 +168,7 @@ def with_options_first(words: Sequence[str]) -> list[str]:
             overrides.append(word)
             continue
         name, _, value = word.partition("=")
-        if name in _WITH_VALUE and not value and left:
+        if name in _HYDRA_VALUES - _INFO and not value and left:
             value = left.pop(0)
         if name in _INFO and not value:
             value = left.pop(0) if left and "=" not in left[0] else "all"

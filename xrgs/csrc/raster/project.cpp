@@ -91,7 +91,9 @@ XRGS_INLINE std::uint32_t find_visible(const Projection& o, const RenderConfig& 
                         (o.mean_x - extent_x < right) & (o.mean_y - extent_y < bottom);
   const Floats opacity_min =
       broadcast(config.culling.sub_threshold ? config.alpha_min : kSmallestNormal);
-  const std::uint32_t drawn = to_bits(o.in_front & (opacity_min <= in_opacity)) & existing;
+  const Floats most = broadcast(3.4028235e38f);
+  const Mask placed = o.in_front & (abs(o.mean_x) <= most) & (abs(o.mean_y) <= most);
+  const std::uint32_t drawn = to_bits(placed & (opacity_min <= in_opacity)) & existing;
   if ((drawn & ~to_bits(in_range)) != 0) *faults |= kTooLarge;
   const Mask visible = (zero < o.det) & in_range & overlaps & (opacity_min <= o.opacity);
   return drawn & to_bits(visible);

@@ -92,6 +92,8 @@ def project(
     area, det = _area_and_determinant(row_x, row_y, eps)
     if not torch.isfinite(det).all():  # of a Gaussian larger than 4e9 px, in float32
         area, det = _area_and_determinant(row_x.double(), row_y.double(), eps)
+        overflows = ~torch.isfinite(det)  # `visible_by_depth` refuses these, if they are drawn
+        area, det = area.masked_fill(overflows, 1.0), det.masked_fill(overflows, 1.0)
     if settings.antialiased:
         opacities = (opacities * area / det.sqrt()).to(opacities)
     cov = torch.stack([xx + eps, xy, yy + eps], dim=-1)  # [M, 3]
@@ -152,7 +154,7 @@ def visible_by_depth(
     extent = (radius_sq.clamp_min(0)[:, None] * projected.cov[:, [0, 2]]).sqrt()  # [N, 2] px
     low, high = projected.means2d - extent, projected.means2d + extent
     size = torch.tensor([camera.width, camera.height])
-    is_drawn = ~(radius_sq < 0)  # NaN where the size overflows
+    is_drawn = (radius_sq >= 0) & torch.isfinite(projected.means2d).all(-1)
     if not (extent[is_drawn] < LARGEST).all():
         raise ValueError(f"scales: a Gaussian is larger than {LARGEST:.0e} px in the image")
     # A covariance that is singular for want of dilation has no inverse.
