@@ -6,7 +6,7 @@ it to `sys.modules`, where a dataclass looks up annotations that are strings; th
 `from __future__ import annotations`.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.util import find_spec
 from typing import Any
 
@@ -25,7 +25,7 @@ class XrgsSweeperConf:
     """The config of `hydra/sweeper: xrgs`."""
 
     _target_: str = "hydra_plugins.xrgs_sweeper.XrgsSweeper"
-    params: dict[str, str] | None = None
+    params: dict[str, str] = field(default_factory=dict)
     """Axes that a file of `sweeps/` sets: comma-separated values by the override's key."""
     brief: bool = False
     """Print only progress and failures: `xrgs-train` says the rest."""
@@ -68,8 +68,8 @@ class XrgsSearchPath(SearchPathPlugin):
 class XrgsSweeper(Sweeper):
     """Plans the cells of a study and launches those that are not done."""
 
-    def __init__(self, params: dict[str, str] | None, brief: bool) -> None:
-        self._params = params or {}
+    def __init__(self, params: dict[str, str], brief: bool) -> None:
+        self._params = params
         self._brief = brief
 
     def setup(

@@ -48,7 +48,7 @@ ONLY_IN = {
     "kornia": ("evaluation/metrics/ssim",),
     "gsplat": ("splat/gsplat/rasterizer",),
     "tqdm": ("runtime/progress", "sweep/monitor"),
-    "av": ("capture/scenes/video", "viewer/film"),
+    "av": ("capture/scenes/deinterlace", "capture/scenes/video", "viewer/film"),
     "imagecodecs": ("capture/colour", "capture/deep"),
     "tifffile": ("capture/deep",),
     "viser": ("viewer/live",),

@@ -7,22 +7,31 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import MISSING, Field, asdict, dataclass, fields, is_dataclass, replace
 from functools import reduce
 from operator import getitem
 from pathlib import Path
 from typing import Any, get_type_hints
 
+import hydra
 import pytest
 import yaml
+from hydra import version
+from hydra.core.singleton import Singleton
+from hydra.core.utils import JobRuntime
+from hydra.errors import HydraException
+from hydra.version import VersionBase
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+import xrgs
 from xrgs.composing import error_line, escape_interpolations, from_dict, from_file
 from xrgs.config import (
     CONF_DIR,
+    PATHS,
     ComponentsConf,
     Conf,
     MipConf,
@@ -223,6 +232,46 @@ def test_a_decay_begins_within_the_run(compose: Compose, key: str, value: int) -
 def test_the_power_of_a_runs_length_has_a_range(compose: Compose, power: str) -> None:
     with pytest.raises(XrgsError, match=r"^splat.optimizer.length_power=.*: must be from 0 to 1"):
         compose(f"splat.optimizer.length_power={power}")
+
+
+@pytest.mark.parametrize(
+    "key", ["seed", "variant.seed", "variant.sfm.seed", "train.steps", "+components.plugins.p.n"]
+)
+def test_a_number_that_nothing_can_hold_names_its_key(compose: Compose, key: str) -> None:
+    with pytest.raises(XrgsError, match=rf"{key.lstrip('+')}=\d+: must be below 2\^(63|31) "):
+        compose(f"{key}={2**63}")
+
+
+def test_every_path_may_begin_with_the_home_folder(
+    compose: Compose, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", "/home/some one")
+    conf = compose(*(f"{key}='~/a, b/c'" for key in PATHS if key != "scene.path"))
+    paths = [conf.scene.masks, conf.variant.poses, conf.store, conf.data_root]
+    assert paths == ["/home/some one/a, b/c"] * 4
+    assert compose("scene=folder", "scene.path='~/a/**'").scene.path == "/home/some one/a/**"
+    assert compose("scene=llff/fern", "data_root='~/d'").scene.path == "/home/some one/d/fern"
+    assert compose("store='~no-such-user/x'").store == "~no-such-user/x"
+
+
+def test_configs_are_composed_where_hydra_is_in_use_and_leave_it_as_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for kind in (VersionBase, JobRuntime):
+        monkeypatch.setitem(Singleton._instances, kind, kind.__new__(kind))
+        kind.instance().__init__()
+    (tmp_path / "mine.yaml").write_text("a: 1\n")
+    with hydra.initialize_config_dir(str(tmp_path), job_name="mine", version_base="1.2"):
+        assert xrgs.compose("seed=3").seed == 3
+        with pytest.raises(HydraException):
+            xrgs.compose("bogus=3")
+        assert str(version.getbase()) == "1.2"
+        assert hydra.compose("mine", return_hydra_config=True).hydra.job.name == "mine"
+
+
+def test_configs_are_composed_in_threads() -> None:
+    with ThreadPoolExecutor(4) as pool:
+        assert [*pool.map(lambda seed: xrgs.compose(f"seed={seed}").seed, range(4))] == [0, 1, 2, 3]
 
 
 @pytest.mark.parametrize("name", ["validation", "hr_share"])

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import math
 import re
+import threading
+from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import is_dataclass
 from functools import cache, reduce
@@ -16,8 +18,9 @@ from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 
-from xrgs.config import CONF_DIR, TRAINING_VIEWS, Conf, known_keys, types_of
+from xrgs.config import CONF_DIR, PATHS, TRAINING_VIEWS, Conf, known_keys, types_of
 from xrgs.errors import XrgsError, did_you_mean
+from xrgs.safeio.paths import user_path
 from xrgs.safeio.records import read_struct
 from xrgs.splat.backend import CHOICES
 from xrgs.splat.settings import NOMINAL_STEPS, SPLITS, STRATEGIES
@@ -25,6 +28,7 @@ from xrgs.splat.settings import NOMINAL_STEPS, SPLITS, STRATEGIES
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
+    from types import ModuleType
 
     from omegaconf import DictConfig
 
@@ -37,6 +41,7 @@ _AT = re.compile(r" - at `\$\.?(.*)`$")
 #: What `conf/config.yaml` has in place of a value that a file of `conf/scene/` sets.
 _OPEN = "???"
 _RETRY = ("none", "failed")
+_HYDRA_LOCK = threading.Lock()
 
 
 def compose(*overrides: str) -> Conf:
@@ -55,10 +60,32 @@ def compose(*overrides: str) -> Conf:
         >>> compose("preset=smoke", "train.steps=100").train.steps
         100
     """
-    import hydra
-
-    with hydra.initialize_config_dir(str(CONF_DIR), version_base="1.3"):
+    with _own_hydra() as hydra:
         return to_conf(hydra.compose("config", list(overrides)))
+
+
+@contextmanager
+def _own_hydra() -> Iterator[ModuleType]:
+    """Initialise Hydra with the config of this package, and leave the caller's own as it was.
+
+    Hydra, its `version_base` and the name of its job are one each in a process. A notebook or a
+    function of `@hydra.main` may be using them, and several threads may compose at once.
+    """
+    import hydra
+    from hydra.core.global_hydra import GlobalHydra
+    from hydra.core.utils import JobRuntime
+    from hydra.version import VersionBase
+
+    with _HYDRA_LOCK:
+        base, job = VersionBase.instance(), JobRuntime.instance()
+        callers = (GlobalHydra.instance().hydra, base.version_base, job.conf)
+        GlobalHydra.instance().clear()
+        job.conf = deepcopy(job.conf)
+        try:
+            with hydra.initialize_config_dir(str(CONF_DIR), version_base="1.3"):
+                yield hydra
+        finally:
+            GlobalHydra.instance().hydra, base.version_base, job.conf = callers
 
 
 def to_conf(cfg: DictConfig) -> Conf:
@@ -83,12 +110,35 @@ def to_conf(cfg: DictConfig) -> Conf:
             return value
         return OmegaConf.to_container(value, resolve=True, throw_on_missing=True)
 
-    conf = from_dict({name: plain(name) for name in map(str, cfg) if name != "hydra"})
+    values = {name: plain(name) for name in map(str, cfg) if name != "hydra"}
+    _check_integers(values)
+    conf = from_dict(values)
+    _expand_home(conf)
     _check_ranges(conf)
     _check_optimizer(conf.splat.optimizer)
+    _check_sfm_seed(conf)
     _check_choices(conf)
     _check_strategy(conf)
     return conf
+
+
+def _expand_home(conf: Conf) -> None:
+    """Put the user's home folder in place of `~` in every path."""
+    for key in PATHS:
+        *groups, name = key.split(".")
+        group = reduce(getattr, groups, conf)
+        path = getattr(group, name)
+        if path is not None and path.startswith("~"):
+            setattr(group, name, str(user_path(path)))
+
+
+def _check_integers(values: dict[str, Any], path: str = "") -> None:
+    """Raise `XrgsError` for an integer that torch can't hold; the message names its key."""
+    for name, value in values.items():
+        if isinstance(value, dict):
+            _check_integers(value, f"{path}{name}.")
+        elif isinstance(value, int) and not -(2**63) <= value < 2**63:
+            raise XrgsError(f"{path}{name}={value}: must be below 2^63 = {2**63}")
 
 
 def _check_ranges(conf: Conf) -> None:
@@ -97,6 +147,7 @@ def _check_ranges(conf: Conf) -> None:
         ("splat.optimizer.shN_every", conf.splat.optimizer.shN_every, 1),
         ("seed", conf.seed, 0),
         ("variant.seed", conf.variant.seed, 0),
+        ("variant.sfm.seed", conf.variant.sfm.seed, 0),
         ("train.steps", conf.train.steps, 1),
         ("train.evaluate_every", conf.train.evaluate_every, 0),
         ("threads", conf.threads, 0),
@@ -128,6 +179,14 @@ def _check_optimizer(optimizer: OptimizerSettings) -> None:
             )
     if not 0 <= (power := optimizer.length_power) <= 1:
         raise XrgsError(f"splat.optimizer.length_power={power}: must be from 0 to 1")
+
+
+def _check_sfm_seed(conf: Conf) -> None:
+    """Raise `XrgsError` where COLMAP can't hold its seed."""
+    if (seed := conf.variant.sfm.seed) >= 2**31:
+        raise XrgsError(
+            f"variant.sfm.seed={seed}: must be below 2^31 = {2**31}, as COLMAP holds it"
+        )
 
 
 def _check_choices(conf: Conf) -> None:

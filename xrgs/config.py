@@ -28,6 +28,8 @@ TRAINING_VIEWS = ("mixed", "all_hr", "hr_only", "lr_only")
 #: `conf/config.yaml`, so that Hydra requires a plus before them.
 PLUS_GROUPS = ("ablation", "sweeps")
 GROUPS = (*PLUS_GROUPS, "scene", "preset", "variant")
+#: The keys whose values are paths; `~` in them is the user's home folder.
+PATHS = ("scene.path", "scene.masks", "variant.poses", "store", "data_root")
 
 
 def off(value: Any) -> Any:

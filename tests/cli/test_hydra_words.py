@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +14,7 @@ from omegaconf.errors import ConfigKeyError
 
 from xrgs import config
 from xrgs.capture.scenes import motorcycle
-from xrgs.cli.hydra_words import explained, with_quotes
+from xrgs.cli.hydra_words import explained, with_options_first, with_quotes
 from xrgs.cli.sweep import texts
 from xrgs.errors import XrgsError
 from xrgs.sweep.axes import expand
@@ -104,6 +105,111 @@ def test_lists_quotes_and_other_keys_stay_as_they_are() -> None:
     assert with_quotes(words) == words
     assert with_quotes(["scene.path=é,b c"]) == ["scene.path='é',b c"]
     assert with_quotes(["store=é,b c"]) == ["store='é,b c'"]
+
+
+@pytest.mark.parametrize(
+    ("written", "given"),
+    [
+        ("seed=0,1", "--multirun seed=0,1"),
+        ("seed=0 -m +ablation=mip", "--multirun seed=0 +ablation=mip"),
+        ("seed=0 --multirun", "--multirun seed=0"),
+        ("seed=0 --config-dir my ~x", "--config-dir my --multirun seed=0 ~x"),
+        ("seed=0 -cd=my=1 scene=a", "-cd my=1 --multirun seed=0 scene=a"),
+        ("seed=0 --cfg job threads=1", "--cfg job seed=0 threads=1"),
+        ("-m -c job --resolve seed=0", "-c job --resolve seed=0"),
+        ("seed=0 --info", "--info all seed=0"),
+        ("--info seed=0", "--info all seed=0"),
+        ("-i plugins seed=0", "-i plugins seed=0"),
+        ("seed=0 hydra.mode=RUN", "seed=0 hydra.mode=RUN"),
+        ("--config-dir ~/my", "--config-dir /home/me/my --multirun"),
+    ],
+)
+def test_options_of_hydra_may_stand_anywhere(
+    written: str, given: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", "/home/me")
+    assert with_options_first(written.split()) == given.split()
+
+
+@pytest.mark.parametrize("name", ["50", "0.5", "1e3", "007", "true", "null"])
+def test_files_of_groups_may_have_names_that_yaml_reads_as_numbers(name: str) -> None:
+    assert parsed(f"+ablation={name}") == name
+    assert parsed(f"+ablation=[mip, {name}]") == ["mip", name]
+    (_, first, second) = expand(with_quotes([f"+ablation={name},mip"]))
+    assert [first.label, second.label] == [name, "mip"]
+
+
+@pytest.mark.parametrize("axis", ["seed=0,1", "+ablation=mip,lean", "seed=0"])
+@pytest.mark.parametrize(
+    ("wrong", "named"),
+    [
+        ("steps=100", "did you mean train.steps"),
+        ("limits.minutes=1h", "limits.minutes"),
+        ("variant=bx", "did you mean box"),
+        ("store=a seed=[1", "seed=[1"),
+    ],
+)
+def test_a_mistake_beside_an_axis_is_named_and_not_the_axis(
+    sweep_here: RunCommand, axis: str, wrong: str, named: str
+) -> None:
+    code, _, err = sweep_here("scene=motorcycle", axis, *wrong.split(), "dry_run=true")
+    assert code == 1
+    assert named in err
+    assert "Ambiguous" not in err
+
+
+HEAD = "# @package _global_\n"
+
+
+@pytest.mark.parametrize(
+    ("content", "named"),
+    [
+        ("components: {mip: {every: 3}}", "ablation/mine.yaml: its first line must be `# @package"),
+        ("# @package _globl_\nseed: 1", "ablation/mine.yaml: its first line must be `# @package"),
+        (HEAD + "components: {mip: {evry: 3}}", "ablation/mine.yaml: components.mip.evry"),
+        (HEAD + "component: {mip: {every: 3}}", "'component' not in 'Conf'; did you mean compon"),
+        (HEAD + "components: {mip: {every: x}}", "components.mip.every: Value 'x' of type 'str'"),
+        (HEAD + "components: {3: 4}", "ablation/mine.yaml: components.3"),
+        (HEAD + "components: {plugins: {3: {}}}", "components.plugins.3: Key 3 (int)"),
+        (HEAD + "seed: [", "a YAML file of the config can't be read: .*mine.yaml"),
+        (HEAD + "seed: 1\nseed: 2", "found duplicate key seed"),
+        (HEAD + "seed: \udcff", "a YAML file of the config can't be read"),
+    ],
+)
+def test_a_mistake_in_a_file_of_the_users_own_is_named(
+    sweep_here: RunCommand, tmp_path: Path, content: str, named: str
+) -> None:
+    (tmp_path / "ablation").mkdir()
+    (tmp_path / "ablation/mine.yaml").write_bytes(content.encode(errors="surrogateescape"))
+    code, _, err = sweep_here("+ablation=mine", "--config-dir", str(tmp_path), "dry_run=true")
+    assert code == 1
+    assert re.search(re.escape(named).replace(r"\.\*", ".*"), err), err
+
+
+def test_an_axis_of_the_sweepers_own_settings_is_planned(sweep_here: RunCommand) -> None:
+    code, _, err = sweep_here(
+        "scene=motorcycle",
+        "variant.test_every=0",
+        '+hydra.sweeper.params.seed="0,1"',
+        "dry_run=true",
+    )
+    assert (code, "plan: 2 cells" in err) == (0, True)
+
+
+def test_a_glob_is_every_file_of_its_group_of_that_name(sweep_here: RunCommand) -> None:
+    _, _, err = sweep_here("scene=motorcycle", "+ablation=glob(mip*)", "dry_run=true")
+    assert "plan: 3 cells" in err
+    assert "/ mip_off_late /" in err
+
+
+def test_the_home_folder_of_a_store_is_not_a_folder_called_tilde(
+    sweep_here: RunCommand, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, children: object
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    (tmp_path / "home").mkdir()
+    sweep_here("scene=motorcycle", "preset=smoke", "+ablation=baseline", "store=~/s")
+    assert (tmp_path / "home/s/cells").is_dir()
+    assert not (tmp_path / "~").exists()
 
 
 def test_bytes_that_are_not_unicode_are_named() -> None:

@@ -172,3 +172,14 @@ def test_bash_completes_a_command(
     )
     done = subprocess.run([bash, "-c", script], cwd=tmp_path, capture_output=True, check=True)
     assert done.stdout.decode().split() == [wanted]
+
+
+@pytest.mark.parametrize("word", ["--store=~/s", "store=~/s"])
+@pytest.mark.parametrize("command", ["status", "report", "store list"])
+def test_the_home_folder_of_every_option_is_expanded(
+    call_command: RunCommand, monkeypatch: pytest.MonkeyPatch, word: str, command: str
+) -> None:
+    monkeypatch.setenv("HOME", "/nowhere")
+    _, out, err = call_command(*command.split(), word)
+    assert "/nowhere/s" in out + err
+    assert "~" not in out + err

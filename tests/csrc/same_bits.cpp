@@ -169,7 +169,7 @@ struct Image {
 
 void render(int threads, const Parameters& p, const xrgs::RenderConfig& config, xrgs::Frame& frame,
             Image& image) {
-  if (xrgs::render(threads, p.view(), config, frame, image.color.data(), image.alpha.data()))
+  if (xrgs::render(threads, p.view(), config, frame, image.color.data(), image.alpha.data()) == 0)
     return;
   std::fputs("the parameters are not valid\n", stderr);
   std::exit(1);

@@ -35,6 +35,7 @@ PACKAGE = Path(identity.__file__).parents[1]
 NO_NUMBERS = {
     "splat/__init__.py",
     "splat/gsplat_api.py",  # gsplat's signature, for users
+    "splat/torch_defaults.py",  # restores torch's own defaults, which every sweep has
     "splat/ply.py",  # saves the trained Gaussians, exactly as its own tests say
     *(f"splat/{name}.py" for name in ("files", "glb", "saved", "spz", "similarity")),  # the same
     "training/__init__.py",

@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from tests.splat.scenes import make_camera, make_scene
-from xrgs.splat.rendering import Render, rasterize_parameters, zero_means2d_offset
+from xrgs.splat.gaussians import Gaussians
+from xrgs.splat.rendering import Render, rasterize, rasterize_parameters, zero_means2d_offset
 from xrgs.splat.settings import RasterSettings
 
 NAMES = ("means", "quats", "scales", "opacities", "sh0", "shN")
@@ -139,3 +140,17 @@ def test_a_value_at_its_bound_is_accepted(backend: str, name: str, bound: float)
     assert (
         draw(backend=backend, **{name: torch.full_like(SCENE[name], bound)}).image.isfinite().all()
     )
+
+
+@pytest.mark.parametrize("name", ["sh0", "shN"])
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_harmonics_of_gaussians_that_are_not_drawn_are_checked(
+    backend: str, name: str, bad: float
+) -> None:
+    camera = make_camera()
+    scene = make_scene(20, camera, dtype=torch.float32)
+    scene["means"][17] = torch.tensor([0.0, 0.0, -5.0])  # behind the camera
+    scene[name][17, 0, 1] = bad
+    gaussians = Gaussians(**scene)
+    with pytest.raises(ValueError, match=f"^{name} has values that are not finite"):
+        rasterize(gaussians, camera, backend=backend)

@@ -18,6 +18,7 @@ from xrgs.errors import XrgsError
 from xrgs.splat.cameras import Camera
 from xrgs.splat.rendering import rasterize
 from xrgs.splat.settings import RasterSettings
+from xrgs.viewer import film
 from xrgs.viewer.film import make_film
 from xrgs.viewer.models import Model
 
@@ -140,3 +141,28 @@ def test_without_pyav_the_extra_is_named(
     with pytest.raises(XrgsError, match=r"pip install 'xrgs\[video\]'; --out FOLDER writes PNG"):
         make_film([model()], tmp_path / "film.mp4")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("size", [(96, 64), (96, 718), (96, 720), (1920, 64)], ids=str)
+def test_the_colours_of_a_film_are_those_of_its_frames_at_every_size(
+    tmp_path: Path, size: tuple[int, int]
+) -> None:
+    """They are decoded by the matrix of BT.709 in float64, which the film must name."""
+    colours = np.array([[204, 76, 51], [230, 30, 30], [30, 220, 40], [30, 60, 220], [9, 20, 40]])
+    frame = np.repeat(colours, 16, axis=0)[None].repeat(size[1], axis=0).astype(np.uint8)
+    frame = np.pad(frame, ((0, 0), (0, size[0] - 80), (0, 0)))
+    film._write_film(iter([frame] * 3), tmp_path / "a.mp4", 10)
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        (stream,) = container.streams.video
+        coder = stream.codec_context
+        named = (coder.color_primaries, coder.color_trc, coder.colorspace, coder.color_range)
+        assert named == (1, 13, 1, 1)
+        planes = next(container.decode(stream)).to_ndarray().astype(float)
+    width, height = size
+    row, middles = height // 2, np.arange(8, 80, 16)
+    chroma = planes[height:].reshape(2, height // 2, width // 2)
+    luma = (planes[row, middles] - 16) / 219
+    blue, red = (chroma[:, row // 2, middles // 2] - 128) / 224
+    r, b = luma + 1.5748 * red, luma + 1.8556 * blue
+    decoded = np.stack([r, (luma - 0.2126 * r - 0.0722 * b) / 0.7152, b], axis=1) * 255
+    assert np.abs(decoded - colours).max() < 4

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from xrgs.capture import dataset, variant
 from xrgs.capture.description import read_report
+from xrgs.splat.torch_defaults import on_cpu_in_float32
 
 if TYPE_CHECKING:
     from xrgs.capture.dataset import Dataset
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 
+@on_cpu_in_float32
 def build_dataset(conf: Conf) -> Dataset:
     """Load the views of a config, building their variant in its store where it is missing.
 
@@ -44,6 +46,7 @@ def build_dataset(conf: Conf) -> Dataset:
     return dataset.load(built, conf.train.views, validation=conf.train.validation, seed=conf.seed)
 
 
+@on_cpu_in_float32
 def load_dataset(folder: str | Path, views: str = "mixed") -> Dataset:
     """Load the views of a variant that a sweep has built.
 

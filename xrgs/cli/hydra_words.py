@@ -14,18 +14,22 @@ from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
+from yaml import YAMLError
 
 from xrgs import composing, config
 from xrgs.capture.scenes.scene import ALL_BELOW
 from xrgs.composing import escape_interpolations
 from xrgs.errors import XrgsError, did_you_mean
 from xrgs.safeio.paths import user_path
+from xrgs.sweep.axis_values import as_name
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from hydra.core.override_parser.types import Override
 
+#: How Hydra says that a file of the config can't be merged into the others.
+_IN_FILE = re.compile(r"In '([^']+)': \w+ raised while composing config:\n")
 #: How Hydra says that a key of an override is unknown.
 _NOT_OVERRIDDEN = re.compile(r"Could not override '([^']+)'")
 #: A text in quotes, and such a text where it is a whole value of a list.
@@ -55,8 +59,23 @@ _MAX_LISTED = 20
 _WHOLE = re.compile(r"\d+(?:\.\d*)?(?:[eE]\+?\d+)?|\d+\.0*")
 #: Keys whose values are lists of names.
 _NAMES = frozenset({"variant.test"})
-#: Keys whose values are paths.
-_PATHS = frozenset({"scene.path", "store", "data_root", "variant.poses", "scene.masks"})
+#: Those whose value is a folder, and the one that needs no value.
+_FOLDERS = frozenset({"--config-dir", "-cd", "--config-path", "-cp"})
+_INFO = frozenset({"--info", "-i"})
+#: What asks Hydra for something else than a sweep.
+_OTHER_MODES = frozenset(
+    (
+        *_INFO,
+        "--cfg",
+        "-c",
+        "--run",
+        "-r",
+        "hydra.mode",
+        "--hydra-help",
+        "--shell-completion",
+        "-sc",
+    )
+)
 
 
 @contextmanager
@@ -73,6 +92,8 @@ def explained(hint: str = "") -> Iterator[None]:
         yield
     except (OmegaConfBaseException, HydraException) as error:
         raise XrgsError(f"{_explained(error)}{hint}") from error
+    except (YAMLError, UnicodeDecodeError) as error:
+        raise XrgsError(f"a YAML file of the config can't be read: {error}") from error
 
 
 def _explained(error: Exception) -> str:
@@ -84,17 +105,33 @@ def _explained(error: Exception) -> str:
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         return _missing_file(error.missing_cfg_file, error.options or ())
     if isinstance(error, OverrideParseException):
-        return f"{error.override}: {composing.error_line(error)}"
+        first, second, *_ = *str(error).splitlines(), ""
+        cause = second if first.startswith("Error parsing override") else first
+        return f"{error.override}: {cause}"
+    if found := _IN_FILE.match(str(error)):
+        return _wrong_file(found[1], error.__context__ or error)
     if found := _NOT_OVERRIDDEN.search(str(error)):
         key = found[1].partition("@")[0]
         return f"{key}: there is no such key{did_you_mean(key, config.known_keys())}"
+    offered = ""
     if isinstance(error, (ConfigKeyError, ConfigAttributeError)):
         parent = error.parent_node
         known = tuple(map(str, parent)) if isinstance(parent, DictConfig) else ()
-        return composing.error_line(error) + did_you_mean(str(error.key), known)
-    if isinstance(error.__cause__, OmegaConfBaseException):  # it names the key and the value
+        offered = did_you_mean(str(error.key), known)
+    elif isinstance(error.__cause__, OmegaConfBaseException):  # it names the key and the value
         return _explained(error.__cause__)
-    return composing.error_line(error)
+    return composing.error_line(error) + offered
+
+
+def _wrong_file(file: str, error: BaseException) -> str:
+    """Return what is wrong in a file of the config, which can't be merged into the others."""
+    group = file.partition("/")[0]
+    key = str(getattr(error, "full_key", ""))
+    if key not in config.types_of(config.Conf) and (key == group or key.startswith("_")):
+        reason = "its first line must be `# @package _global_`"
+    else:
+        reason = _explained(error) if isinstance(error, Exception) else str(error)
+    return f"{file}.yaml: {reason}"
 
 
 def _missing_file(file: str, options: Sequence[str]) -> str:
@@ -111,6 +148,38 @@ def _missing_file(file: str, options: Sequence[str]) -> str:
         all_known = f"; xrgs-sweep --help lists all {len(known)}"
     offered = did_you_mean(name, known) or all_known
     return f"{group}={name}: there is no such choice{offered}"
+
+
+def with_options_first(words: Sequence[str]) -> list[str]:
+    """Return a command line as Hydra's parser takes it: its options first, then all overrides.
+
+    `--multirun` is added where Hydra is asked for a sweep: without it, Hydra checks axes before
+    anything else, and blames them for every other mistake.
+
+    Args:
+        words: Arguments of the command line, in any order.
+    """
+    options: list[str] = []
+    overrides: list[str] = []
+    left = list(words)
+    while left:
+        word = left.pop(0)
+        if not word.startswith("-"):
+            overrides.append(word)
+            continue
+        name, _, value = word.partition("=")
+        if name in _HYDRA_VALUES - _INFO and not value and left:
+            value = left.pop(0)
+        if name in _INFO and not value:
+            value = left.pop(0) if left and "=" not in left[0] else "all"
+        if name in _FOLDERS and value:
+            value = str(user_path(value))
+        if name not in ("--multirun", "-m"):
+            options += [name, value] if value else [name]
+    other = [word for word in (*options, *overrides) if word.partition("=")[0] in _OTHER_MODES]
+    if not other:
+        options.append("--multirun")
+    return options + overrides
 
 
 def with_quotes(words: Sequence[str]) -> list[str]:
@@ -140,14 +209,13 @@ def _with_quotes(word: str) -> str:
         return word
     if key in _NAMES:
         quoted = _quoted_lists(value)
-    elif (value[0] in "'\"" or key in config.GROUPS) and _parsed(word):
+    elif value[0] in "'\"" and _parsed(word):
         quoted = value
     elif key in config.GROUPS:
-        parts = _parts(value)
-        quoted = ",".join(part if part[:1] == "[" else _quoted(key, part) for part in parts)
+        quoted = ",".join(_quoted_choice(key, part) for part in _parts(value))
     elif key == "scene.name":
         quoted = _quoted(key, escape_interpolations(value))
-    elif key in _PATHS:
+    elif key in config.PATHS:
         parts = value.split(",") if key == "scene.path" and not _exists(value) else [value]
         quoted = ",".join(_quoted_path(key, part) for part in parts)
     elif _is_whole_number(key):
@@ -208,6 +276,14 @@ def _quoted(key: str, value: str) -> str:
     if override and not override.is_sweep_override() and override.value() == value:
         return value
     return QuotedString(value, Quote.single).with_quotes()
+
+
+def _quoted_choice(key: str, value: str) -> str:
+    """Return the name of a file of a group, or a list of names, as Hydra reads names."""
+    if value[:1] == "[" and value[-1:] == "]":
+        names = [part.strip() for part in _parts(value[1:-1])]
+        return f"[{','.join(n if _QUOTED.fullmatch(n) else _quoted(key, n) for n in names)}]"
+    return as_name(value) if _parsed(f"{key}={value}") else _quoted(key, value)
 
 
 def _quoted_lists(value: str) -> str:

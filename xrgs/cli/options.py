@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, get_type_hints
 
 import tyro
 from tyro.conf import CascadeSubcommandArgs, DisallowNone, FlagCreatePairsOff, OmitArgPrefixes, arg
+from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 import xrgs
 from xrgs.config import known_keys
@@ -49,6 +50,21 @@ _CONFIG = (
     FlagCreatePairsOff,  # no --no-dry-run beside --dry-run
     OmitArgPrefixes,  # --scenes, not --which.scenes, for an option in a dataclass
 )
+_REGISTRY = ConstructorRegistry()
+
+
+@_REGISTRY.primitive_rule
+def _path(kind: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Path] | None:
+    """Read a path with `~` for the home folder, which shells leave as it is in `--out=~/a`."""
+    if kind.type is not Path:
+        return None
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="PATH",
+        instance_from_str=lambda words: user_path(words[0]),
+        is_instance=lambda value: isinstance(value, Path),
+        str_from_instance=lambda path: [str(path)],
+    )
 
 
 def run(
@@ -83,12 +99,16 @@ def run(
     words = _with_options(sys.argv[1:], assignment, known)
     with errors_as_messages(command, assignment):
         if callable(target):
-            tyro.cli(_unwrapped(target), prog=command, args=words, config=_CONFIG)
+            tyro.cli(
+                _unwrapped(target), prog=command, args=words, config=_CONFIG, registry=_REGISTRY
+            )
             return
         app = tyro.extras.SubcommandApp()
         for name, function in target.items():
             app.command(name=name, is_default=name == default)(_unwrapped(function))
-        app.cli(prog=command, description=description, args=words, config=_CONFIG)
+        app.cli(
+            prog=command, description=description, args=words, config=_CONFIG, registry=_REGISTRY
+        )
 
 
 def _unwrapped(function: Callable[..., None]) -> Callable[..., None]:

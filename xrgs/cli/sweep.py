@@ -15,12 +15,13 @@ from hydra.errors import CompactHydraException
 from omegaconf import MISSING, DictConfig, OmegaConf
 
 from xrgs import config
-from xrgs.cli.hydra_words import check_words, explained, files, with_quotes
+from xrgs.cli.hydra_words import check_words, explained, files, with_options_first, with_quotes
 from xrgs.cli.key_help import explain
 from xrgs.cli.options import answer_version, errors_as_messages
 from xrgs.composing import escape_interpolations
 from xrgs.runtime.signals import exit_on_signal
 from xrgs.runtime.streams import guard_streams, say
+from xrgs.safeio.paths import user_path
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -143,7 +144,7 @@ def run(command: str, words: Sequence[str], hint: str) -> None:
             problem.
     """
     with exit_on_signal(hint), _hydra_errors(command):
-        sys.argv[1:] = with_quotes(words)
+        sys.argv[1:] = with_options_first(with_quotes(words))
         _run_job()
 
 
@@ -172,7 +173,7 @@ def _rerun(arguments: list[str]) -> None:
     hint = " (rerun= takes out=, store=, threads=, scene.path= and plugins=)"
     with errors_as_messages("xrgs-sweep"), explained(hint):
         conf = OmegaConf.merge(OmegaConf.structured(RerunConf), texts(arguments))
-        out, store = (Path(path) if path else None for path in (conf.out, conf.store))
+        out, store = (user_path(path) if path else None for path in (conf.out, conf.store))
         photographs, plugins = conf.scene.path, conf.plugins.split(",")
         cell, there = Path(conf.rerun), Store(store or DEFAULT_STORE)
         if not cell.exists() and there.exists:

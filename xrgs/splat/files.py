@@ -11,6 +11,7 @@ from xrgs.splat.glb import read_glb, write_glb
 from xrgs.splat.ply import read_ply, save_ply
 from xrgs.splat.saved import check_is_read
 from xrgs.splat.spz import read_spz, write_spz
+from xrgs.splat.torch_defaults import on_cpu_in_float32
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -29,6 +30,7 @@ READERS: dict[str, Callable[[Path], SavedGaussians]] = {
 _UP = (0.0, -1.0, 0.0)
 
 
+@on_cpu_in_float32
 def load_gaussians(path: str | Path) -> SavedGaussians:
     """Read a file of Gaussians, and whether they are to be rendered antialiased.
 
@@ -50,6 +52,7 @@ def load_gaussians(path: str | Path) -> SavedGaussians:
     return READERS[_suffix(path)](path)
 
 
+@on_cpu_in_float32
 def save_gaussians(
     path: str | Path,
     gaussians: Gaussians,

@@ -18,6 +18,7 @@ from xrgs.splat.settings import RasterSettings
 from xrgs.splat.sh import C0, MAX_DEGREE, bases
 from xrgs.splat.torch.projection import depths as camera_depths
 from xrgs.splat.torch.projection import project
+from xrgs.splat.torch_defaults import on_cpu_in_float32
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -51,6 +52,7 @@ class _Projections(NamedTuple):
     opacities: Tensor  # [C, N], compensated if antialiased
 
 
+@on_cpu_in_float32
 def rasterization(
     means: Tensor,
     quats: Tensor,

@@ -27,6 +27,7 @@ from xrgs.splat.saved import (
     to_gaussians,
 )
 from xrgs.splat.sh import MAX_DEGREE, bases
+from xrgs.splat.torch_defaults import on_cpu_in_float32
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -48,6 +49,7 @@ _RENDER_MODE = re.compile(r"splatrendermode:\s*(\S+)|antialiased\s+([01])")
 _HIGHEST = 16
 
 
+@on_cpu_in_float32
 def save_ply(
     path: str | Path, gaussians: Gaussians, *, antialiased: bool = False, durable: bool = True
 ) -> None:
@@ -90,6 +92,7 @@ def save_ply(
         file.write(table.numpy().astype("<f4").tobytes())
 
 
+@on_cpu_in_float32
 def load_ply(path: str | Path) -> Gaussians:
     """Read Gaussians that `save_ply`, or any 3D Gaussian Splatting trainer, wrote.
 

@@ -24,7 +24,7 @@ def rotation_matrices(quats: Tensor) -> Tensor:
     # After a division by the largest component the norm is finite. The rotation does not depend on
     # the length, so this factor needs no gradient.
     largest = quats.detach().abs().amax(dim=-1, keepdim=True)  # [M, 1]
-    zero = largest < torch.finfo(quats.dtype).tiny ** 0.5
+    zero = largest == 0
     identity = quats.new_tensor([1.0, 0.0, 0.0, 0.0])
     scaled = torch.where(zero, identity, quats / largest.masked_fill(zero, 1.0))  # [M, 4]
     w, x, y, z = scaled.unbind(-1)  # [M] each

@@ -14,6 +14,7 @@ from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import ActivatedGaussians, Gaussians
 from xrgs.splat.settings import RasterSettings
 from xrgs.splat.sh import check_sh_degree
+from xrgs.splat.torch_defaults import on_cpu_in_float32
 
 #: Shape of one Gaussian's value; the shape of shN depends on the number of bands.
 _SHAPES: dict[str, tuple[int, ...]] = {
@@ -46,6 +47,7 @@ class Render:
     """`evaluations` if every pixel of a tile met every Gaussian in the tile's list."""
 
 
+@on_cpu_in_float32
 def rasterize(
     gaussians: Gaussians,
     camera: Camera,
@@ -86,6 +88,7 @@ def rasterize(
         torch.Size([50, 3])
     """
     settings = settings or RasterSettings()
+    _check_harmonics(gaussians)
     if sh_degree is None:
         stored = math.isqrt(gaussians.shN.shape[1] + 1) - 1  # K = (degree + 1)^2
         sh_degree = min(settings.sh_degree, stored)
@@ -200,6 +203,14 @@ def backend_for(means: Tensor, backend: str) -> str:
         renderer = "xrgs renders on the CPU" if where == "cpu" else f"gsplat renders on {where}"
         raise ValueError(f"means is on {means.device}: {renderer}, use means.to({where!r})")
     return "torch" if backend == "auto" and means.dtype != torch.float32 else backend
+
+
+def _check_harmonics(gaussians: Gaussians) -> None:
+    """Check the harmonics of all Gaussians: the kernels read those only that are drawn."""
+    for name in ("sh0", "shN"):
+        value = getattr(gaussians, name).detach()
+        if not value.sum().isfinite() and not torch.isfinite(value).all():
+            raise ValueError(f"{name} has values that are not finite")
 
 
 def _check_shapes(values: dict[str, Tensor]) -> None:

@@ -6,14 +6,17 @@ import itertools
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf.errors import OmegaConfBaseException
 
+from xrgs.config import GROUPS
 from xrgs.errors import XrgsError
 from xrgs.experiment.store import BASELINE
+from xrgs.sweep.axis_values import as_name, parsed
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
+    from hydra.core.config_loader import ConfigLoader
     from hydra.core.override_parser.types import Override
 
 
@@ -55,22 +58,23 @@ def effective(arguments: Sequence[str]) -> list[str]:
 
     The axes of a sweep's file come first, and the command line may set some of them again.
     """
-    overrides = OverridesParser.create().parse_overrides(list(arguments))
+    overrides = parsed(arguments)
     last = {override.get_key_element(): override.input_line for override in overrides}
     return [line for line in last.values() if line is not None]
 
 
-def expand(arguments: Sequence[str]) -> list[CellSpec]:
+def expand(arguments: Sequence[str], loader: ConfigLoader | None = None) -> list[CellSpec]:
     """Return every combination of the axes, each group with its matching baseline first.
 
     Args:
         arguments: Hydra overrides, for example `+ablation=consistency,loss_weighting` and
             `seed=0,1`.
+        loader: Lists the files of a group, for `glob(...)`.
 
     Raises:
-        XrgsError: An axis is an interval instead of a list of values.
+        XrgsError: An axis is an interval instead of a list of values, or has no value.
     """
-    overrides = OverridesParser.create().parse_overrides(list(arguments))
+    overrides = parsed(arguments, loader)
     axes = {override.get_key_element(): _values(override) for override in overrides}
     swept = {key for key, values in axes.items() if len(values) > 1}
     specs: dict[CellSpec, None] = {}
@@ -99,11 +103,17 @@ def expand(arguments: Sequence[str]) -> list[CellSpec]:
 def _values(override: Override) -> list[str]:
     """Return the override once for each of its values."""
     key = override.get_key_element()
-    if not override.is_sweep_override():
-        return [f"{key}={override.get_value_element_as_str()}"]
-    if not override.is_discrete_sweep():
-        raise XrgsError(f"{override.input_line}: an axis must be a list of values")
-    return [f"{key}={value}" for value in override.sweep_string_iterator()]
+    try:
+        if not override.is_sweep_override():
+            return [f"{key}={override.get_value_element_as_str()}"]
+        if not override.is_discrete_sweep():
+            raise XrgsError(f"{override.input_line}: an axis must be a list of values")
+        values = list(override.sweep_string_iterator())
+    except OmegaConfBaseException as error:  # a function among the values of a list
+        raise XrgsError(f"{override.input_line}: an axis is one list, or one function") from error
+    if not values:
+        raise XrgsError(f"{override.input_line}: this axis has no value")
+    return [f"{key}={as_name(value) if _name(key) in GROUPS else value}" for value in values]
 
 
 def _name(text: str) -> str:

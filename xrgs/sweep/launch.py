@@ -242,7 +242,7 @@ class Launches:
 
     def _begin(self, store: Store) -> SweepSession:
         """Create the session's folder, and give its full path to every job."""
-        folder = _create_unique(Path(self._config.hydra.sweep.dir).absolute(), store)
+        folder = _create_unique(user_path(self._config.hydra.sweep.dir).absolute(), store)
         self._set("sweep.dir", escape_interpolations(str(folder)))
         session = SweepSession(folder)
         session.begin()

@@ -248,7 +248,7 @@ class Study:
                 or `baseline=false` leaves no cell.
         """
         plan: dict[CellSpec, PlannedCell] = {}
-        combinations = expand(arguments)
+        combinations = expand(arguments, self._context.config_loader)
         for spec in dict.fromkeys(map(self._with_effective_match, combinations)):
             cell = planned(spec, self._compose(spec))
             if cell.reference is not None:

@@ -17,6 +17,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from xrgs.errors import XrgsError
+from xrgs.splat.torch_defaults import on_cpu_in_float32
 from xrgs.training.checkpoint import Checkpoint
 from xrgs.training.components.base import Component, Step, check_not_negative
 from xrgs.training.loop import train
@@ -40,6 +41,7 @@ _POWER_RANGE = 0.5, 5.0
 """Bounds of the measured p; counts are noisy, and not quite monotone in the threshold."""
 
 
+@on_cpu_in_float32
 def train_cell(
     data: Dataset,
     conf: Conf,

@@ -34,6 +34,9 @@ if TYPE_CHECKING:
 _MP4 = ".mp4"
 #: Smallest and largest side of a panel, px, and the most frames of a film.
 _SIDES, _MAX_FRAMES = (16, 8192), 100_000
+#: The colours of a film by ITU-T H.273: primaries and matrix of BT.709, curve of sRGB, limited
+#: range. Players would take BT.601's matrix for small films and BT.709's for large ones.
+_PRIMARIES, _CURVE, _MATRIX, _LIMITED = 1, 13, 1, 1
 #: x264's constant rate factor: 18 is taken to be visually lossless.
 _CRF = "18"
 #: The share of a panel's height that a label takes, and its smallest size, px.
@@ -167,10 +170,16 @@ def _write_film(frames: Iterable[Frame], out: Path, fps: int) -> None:
     with atomic_writer(out) as stream, av.open(stream, "w", format="mp4") as container:
         video: Any = container.add_stream("libx264", rate=fps, options={"crf": _CRF})
         video.pix_fmt = "yuv420p"  # what browsers and players show
+        coder = video.codec_context
+        coder.color_primaries, coder.color_trc = _PRIMARIES, _CURVE
+        coder.colorspace, coder.color_range = _MATRIX, _LIMITED
         for number, frame in enumerate(frames):
             if number == 0:
                 video.height, video.width = frame.shape[:2]
-            container.mux(video.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+            picture = av.VideoFrame.from_ndarray(frame, format="rgb24").reformat(
+                format=video.pix_fmt, dst_colorspace=_MATRIX, dst_color_range=_LIMITED
+            )
+            container.mux(video.encode(picture))
         container.mux(video.encode())
 
 

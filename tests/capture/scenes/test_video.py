@@ -35,7 +35,7 @@ BT601, BT709, BT2020 = (0.299, 0.114), (0.2126, 0.0722), (0.2627, 0.0593)
 def textured(level: int, blur: int) -> NDArray[np.uint8]:
     """A frame of a brightness that names it, with stripes of a contrast that falls with `blur`."""
     frame = np.full((HEIGHT, WIDTH, 3), level, np.uint8)
-    frame[8:40:4] += np.uint8(48 >> blur)
+    frame[:, 8:40:4] += np.uint8(48 >> blur)
     return frame
 
 
@@ -46,6 +46,7 @@ def write_video(
     pixels: tuple[str, str] = ("rgb24", "yuv420p"),
     colours: tuple[int, int, int] = (2, 2, 2),
     aspect: Fraction = Fraction(1),
+    options: dict[str, str] | None = None,
 ) -> None:
     """Write a video.
 
@@ -56,11 +57,13 @@ def write_video(
         pixels: The formats of the frames, and of the video.
         colours: Primaries, curve and matrix by ITU-T H.273.
         aspect: Width by height of a pixel.
+        options: Options of the codec.
     """
     with av.open(str(file), "w") as container:
         stream = container.add_stream(codec, rate=Fraction(10))
         stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, pixels[1]
         stream.bit_rate = 4_000_000
+        stream.options = options or {}
         context = stream.codec_context
         context.color_primaries, context.color_trc, context.colorspace = colours
         context.sample_aspect_ratio = aspect
@@ -162,6 +165,80 @@ def test_colours_are_converted_to_srgb(
     stripe = WIDTH // len(PATCHES)
     middles = images.read(scene.files["frame_0000"])[HEIGHT // 2, stripe // 2 :: stripe] * 255
     assert np.abs(middles - PATCHES).max() <= 4  # 8 bits of YUV, and of RGB in between
+
+
+def test_the_colours_of_large_videos_that_name_none_are_those_that_players_take(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """BT.709's from 720 rows on, as in Chromium, and BT.601's below."""
+    middles = []
+    for height in (718, 720):
+        monkeypatch.setattr(f"{__name__}.HEIGHT", height)
+        write_video(
+            tmp_path / f"{height}.mkv",
+            [patches(TO_SRGB, BT709 if height >= 720 else BT601)] * 2,
+            "ffv1",
+            ("yuv420p", "yuv420p"),
+        )
+        scene = scenes.resolve(conf(tmp_path / f"{height}.mkv", 2), tmp_path / str(height))
+        middles.append(images.read(scene.files["frame_0000"])[height // 2, 8::16] * 255)
+    assert np.abs(np.array(middles) - PATCHES).max() <= 4
+
+
+def moving(frames: int) -> list[NDArray[np.uint8]]:
+    """Frames of smooth waves that move by three pixels each."""
+    y, x = np.mgrid[:HEIGHT, : WIDTH + 3 * frames]
+    waves = np.sin(x / 3 + y / 7) + np.sin(x / 5 - y / 4) + np.sin(x / 11 + y / 3)
+    picture = np.repeat((128 + 36 * waves).round().astype(np.uint8)[..., None], 3, axis=2)
+    return [picture[:, 3 * i : 3 * i + WIDTH] for i in range(frames)]
+
+
+def woven(fields: Sequence[NDArray[np.uint8]], first: int) -> list[NDArray[np.uint8]]:
+    """Frames of two pictures each, the lines of the first of which begin at line `first`."""
+    frames = []
+    for early, late in zip(fields[::2], fields[1::2], strict=True):
+        frame = late.copy()
+        frame[first::2] = early[first::2]
+        frames.append(frame)
+    return frames
+
+
+@pytest.mark.parametrize("first", [0, 1], ids=["top", "bottom"])
+@pytest.mark.parametrize("flags", ["", "tff=1:interlaced=1"], ids=["unmarked", "marked"])
+def test_interlaced_frames_are_shown_deinterlaced(tmp_path: Path, first: int, flags: str) -> None:
+    if flags and first:
+        flags = flags.replace("tff", "bff")
+    fields = moving(40)
+    options = {"crf": "6", "x264-params": flags}
+    write_video(tmp_path / "a.mp4", woven(fields, first), "libx264", options=options)
+    scene = scenes.resolve(conf(tmp_path / "a.mp4", 20), tmp_path)
+    for number, file in enumerate(scene.files.values()):
+        shown = images.read(file)[4:-4, 4:-4] * 255
+        errors = [np.abs(shown - field[4:-4, 4:-4]).mean() for field in fields]
+        assert min(errors) < 4, number
+        assert np.argmin(errors) // 2 == number
+
+
+def test_a_sharp_frame_is_taken_before_a_combed_one(tmp_path: Path) -> None:
+    fields = moving(40)
+    blurred = [(frame // 2 + 64).astype(np.uint8) for frame in fields]
+    frames = woven(blurred, 0)
+    frames[7::10] = fields[14::20]
+    options = {"crf": "6", "x264-params": "tff=1:interlaced=1"}
+    write_video(tmp_path / "a.mp4", frames, "libx264", options=options)
+    scene = scenes.resolve(conf(tmp_path / "a.mp4", 2), tmp_path)
+    contrast = [images.read(file).std() for file in scene.files.values()]
+    assert min(contrast) > 1.5 * blurred[0].std() / 255
+
+
+@pytest.mark.parametrize("step", [0, 1, 3])
+def test_progressive_frames_stay_as_they_are(tmp_path: Path, step: int) -> None:
+    frames = [moving(1)[0]] * 9 if step == 0 else moving(10 * step)[::step]
+    pixels = ("gray8", "gray8")
+    write_video(tmp_path / "a.mkv", [frame[..., 0] for frame in frames], "ffv1", pixels)
+    scene = scenes.resolve(conf(tmp_path / "a.mkv", len(frames)), tmp_path)
+    for frame, file in zip(frames, scene.files.values(), strict=True):
+        assert np.abs(images.read(file) * 255 - frame).max() <= 1
 
 
 @pytest.mark.parametrize(("transfer", "name"), [(16, "PQ"), (18, "HLG")])

@@ -18,7 +18,7 @@ from torch.nn.functional import avg_pool2d, grid_sample
 
 _NEAR = 0.05
 #: The direction towards the light: above, left, and on the cameras' side (y points down).
-_LIGHT = torch.tensor([-0.35, -0.75, -0.56])
+_LIGHT = torch.tensor([-0.35, -0.75, -0.56], dtype=torch.float32, device="cpu")
 _AMBIENT = 0.75
 #: The angle from a ball's -z pole, the centre of its texture, at which the texture ends, radians.
 _BALL_REACH = 0.6 * math.pi

@@ -3,8 +3,8 @@
 The frames are divided into as many parts as views are wanted, and the sharpest of each part is
 taken. Sharpness is the variance of the Laplacian of the brightness [pechpacheco2000], at a reduced
 size, where the noise of the sensor counts little. Frames are taken as a player shows them: with
-square pixels, upright and in sRGB. HDR is refused, as in photographs. Nothing here imports av
-before frames are read.
+square pixels, upright, deinterlaced and in sRGB. HDR is refused, as in photographs. Nothing here
+imports av before frames are read.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ import numpy as np
 
 from xrgs.capture import colour, images
 from xrgs.capture.scenes import rendered
+from xrgs.capture.scenes.deinterlace import deinterlaced
 from xrgs.capture.scenes.scene import Scene, check_views, label
 from xrgs.errors import UnreadableError, XrgsError
 from xrgs.runtime.progress import ProgressBar
@@ -46,7 +47,13 @@ _SHARPNESS_SIDE = 640
 _CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg"
 
 #: The source files that decide the frames, relative to the package.
-_SOURCES = ("capture/colour.py", "capture/images.py", "capture/scenes/video.py")
+_SOURCES = (
+    *("capture/colour.py", "capture/images.py"),
+    *("capture/scenes/deinterlace.py", "capture/scenes/video.py"),
+)
+#: H.273's number of a matrix that is not named, and the rows from which on players then take that
+#: of BT.709; for smaller frames they take that of BT.601.
+_UNKNOWN_MATRIX, _HD_ROWS = 2, 720
 
 
 @dataclass(frozen=True)
@@ -159,7 +166,7 @@ def _frames(file: Path) -> Iterator[_Frame]:
             # Asked before frames are decoded: some decoders forget what the container says.
             codec, aspect = video.codec_context, video.sample_aspect_ratio or Fraction(1)
             encoding = colour.from_h273(codec.color_primaries, codec.color_trc)
-            for frame in container.decode(video):
+            for frame in deinterlaced(container.decode(video)):
                 width, height = _square(frame.width, frame.height, aspect)
                 if width * height > images.MAX_PIXELS:
                     size = f"{width} x {height}"
@@ -192,7 +199,11 @@ def _brightness(frame: VideoFrame) -> NDArray[np.uint8]:
 
 def _shown(frame: _Frame) -> images.ImageArray:
     """Return a frame [H, W, 3] in 0..1: in sRGB, with square pixels, and turned."""
-    pixels = frame.decoded.to_ndarray(format="rgb24")
+    decoded = frame.decoded
+    is_hd = decoded.colorspace == _UNKNOWN_MATRIX and decoded.height >= _HD_ROWS
+    pixels = decoded.reformat(
+        format="rgb24", src_colorspace="ITU709" if is_hd else None
+    ).to_ndarray()
     image, _ = colour.convert(pixels, None, frame.encoding)
-    turned = np.rot90(images.resize(image, *frame.size), round(frame.decoded.rotation / 90) % 4)
+    turned = np.rot90(images.resize(image, *frame.size), round(decoded.rotation / 90) % 4)
     return np.ascontiguousarray(turned)

@@ -115,7 +115,8 @@ bool all_finite(const float* p, std::size_t count) {
 }
 
 // Finds the parameter that made a render fail, and throws an error that names it.
-[[noreturn]] void throw_invalid_parameter(const ParameterTensors& t, bool raw) {
+[[noreturn]] void throw_invalid_parameter(const ParameterTensors& t, bool raw,
+                                          std::uint32_t faults) {
   const auto check = [](const char* name, const auto& array) {
     if (!all_finite(array.data(), array.size()))
       throw nb::value_error((std::string(name) + " has values that are not finite").c_str());
@@ -136,6 +137,8 @@ bool all_finite(const float* p, std::size_t count) {
   for (std::size_t i = 0; !raw && i < t.opacities.size(); ++i)
     if (t.opacities.data()[i] < 0.0f || t.opacities.data()[i] > 1.0f)
       throw nb::value_error("opacities has values outside 0..1");
+  if ((faults & kTooLarge) != 0)
+    throw nb::value_error("scales: a Gaussian is larger than 1e18 px in the image");
   throw nb::value_error("sh0 and shN overflow: a colour is above 1e38");
 }
 
@@ -170,18 +173,19 @@ std::tuple<Output, Output> forward(FrameHandle& frame, const RenderConfig& confi
   const auto height = static_cast<std::size_t>(config.height);
   const auto width = static_cast<std::size_t>(config.width);
   Output image = new_array<float>({height, width, 3}), alpha = new_array<float>({height, width});
-  bool params_valid = true, allocation_ok = true;
+  std::uint32_t faults = 0;
+  bool allocation_ok = true;
   {
     nb::gil_scoped_release release;
     try {
-      params_valid = render(threads, parameters, config, *frame, static_cast<float*>(image.data()),
-                            static_cast<float*>(alpha.data()));
+      faults = render(threads, parameters, config, *frame, static_cast<float*>(image.data()),
+                      static_cast<float*>(alpha.data()));
     } catch (const std::bad_alloc&) {
       allocation_ok = false;
     }
   }
   if (!allocation_ok) throw_out_of_memory(*frame);
-  if (!params_valid) throw_invalid_parameter(tensors, config.raw);
+  if (faults != 0) throw_invalid_parameter(tensors, config.raw, faults);
   return {std::move(image), std::move(alpha)};
 }
 

@@ -19,8 +19,6 @@ constexpr float kSqrtLog2e = 1.20112241f;
 // alpha_min, so that rounding in the tests of tiles and blocks never drops a pixel.
 constexpr float kCutoffMargin = 0.01f;
 
-constexpr float kSmallestNormal = 1.17549435e-38f;
-
 // Zero where all inputs are finite, otherwise NaN: zero times a number is zero, zero times infinity
 // or NaN is NaN.
 XRGS_INLINE Floats sum_times_zero(const GaussianInputs& in) {
@@ -70,15 +68,21 @@ XRGS_INLINE Vector3 unclamped_colors(const GaussianParameters& p, std::int64_t g
   return color;
 }
 
-XRGS_INLINE Mask is_visible(const Projection& o, const RenderConfig& config,
-                            Floats cutoff_radius_sq) {
+// A bit for each visible Gaussian. Sets kTooLarge for one that would be visible if float32 held its
+// size.
+XRGS_INLINE std::uint32_t find_visible(const Projection& o, const RenderConfig& config,
+                                       Floats in_opacity, Floats cutoff_radius_sq,
+                                       std::uint32_t existing, std::uint32_t* faults) {
   // The squared radius in standard deviations is 2 ln(opacity / alpha_min) = 2 ln 2
   // cutoff_radius_sq.
   const Floats sigma_sq = broadcast(2.0f / kLog2e) * cutoff_radius_sq;
   const Floats zero = broadcast(0.0f), huge = broadcast(1e18f);
-  const Floats extent_x = sqrt(sigma_sq * o.xx), extent_y = sqrt(sigma_sq * o.yy);  // Eq. 12
-  const Mask usable =
-      (zero < o.det) & (o.det < broadcast(3e38f)) & (extent_x < huge) & (extent_y < huge);
+  Floats extent_x = sqrt(sigma_sq * o.xx), extent_y = sqrt(sigma_sq * o.yy);  // Eq. 12
+  if (any(o.huge)) {
+    extent_x = select(o.huge, broadcast(kHugePixel) * extent_x, extent_x);
+    extent_y = select(o.huge, broadcast(kHugePixel) * extent_y, extent_y);
+  }
+  const Mask in_range = (o.det < broadcast(3e38f)) & (extent_x < huge) & (extent_y < huge);
   const bool anywhere = !config.culling.out_of_view;  // then only what overflows is dropped
   const Floats left = anywhere ? -huge : zero;
   const Floats right = anywhere ? huge : broadcast(static_cast<float>(config.width));
@@ -87,13 +91,23 @@ XRGS_INLINE Mask is_visible(const Projection& o, const RenderConfig& config,
                         (o.mean_x - extent_x < right) & (o.mean_y - extent_y < bottom);
   const Floats opacity_min =
       broadcast(config.culling.sub_threshold ? config.alpha_min : kSmallestNormal);
-  return o.in_front & (opacity_min <= o.opacity) & usable & overlaps;
+  const Floats most = broadcast(3.4028235e38f);
+  const Mask placed = o.in_front & (abs(o.mean_x) <= most) & (abs(o.mean_y) <= most);
+  const std::uint32_t drawn = to_bits(placed & (opacity_min <= in_opacity)) & existing;
+  if ((drawn & ~to_bits(in_range)) != 0) *faults |= kTooLarge;
+  const Mask visible = (zero < o.det) & in_range & overlaps & (opacity_min <= o.opacity);
+  return drawn & to_bits(visible);
 }
 
 XRGS_INLINE void store_projected(const Projection& o, Floats log2_opacity, Floats cutoff_radius_sq,
                                  const Vector3& color, std::uint32_t visible,
                                  ProjectedGaussian* projected) {
-  const ConicFactor factor = conic_factor(o);
+  ConicFactor factor = conic_factor(o);
+  if (any(o.huge)) {
+    factor.xx = o.unit * factor.xx;
+    factor.xy = o.unit * factor.xy;
+    factor.yy = o.unit * factor.yy;
+  }
   const Floats to_base_2 = broadcast(kSqrtLog2e), zero = broadcast(0.0f);
   const Floats chol_xx = factor.xx * to_base_2, chol_xy = factor.xy * to_base_2;
   const Floats chol_yy = factor.yy * to_base_2;
@@ -128,15 +142,16 @@ XRGS_INLINE void store_projected(const Projection& o, Floats log2_opacity, Float
 template <int Degree>
 std::uint32_t project_group(const GaussianParameters& p, const RenderConfig& config,
                             std::int64_t group, int lanes, Frame& frame, float* depths,
-                            bool* params_valid) {
+                            std::uint32_t* faults) {
   const GaussianInputs in = load_inputs(p, config.raw, group, lanes);
-  if (to_bits(valid_inputs(in)) != 0xffffu) *params_valid = false;
+  if (to_bits(valid_inputs(in)) != 0xffffu) *faults |= kWrongParameter;
   const Projection o = project_inputs(in, config);
   const Floats log2_opacity = log2(max(o.opacity, broadcast(kSmallestNormal)));
   const Floats cutoff_radius_sq =
       max(log2_opacity - broadcast(config.log2_alpha_min), broadcast(0.0f));
   const std::uint32_t existing = lanes == 16 ? 0xffffu : (1u << lanes) - 1u;
-  const std::uint32_t visible = to_bits(is_visible(o, config, cutoff_radius_sq)) & existing;
+  const std::uint32_t visible =
+      find_visible(o, config, in.opacity, cutoff_radius_sq, existing, faults);
   if (visible == 0) return 0;
   Floats inv_distance;
   const Vector3 direction = view_direction(in.mean, config.camera_position, inv_distance);
@@ -146,7 +161,7 @@ std::uint32_t project_group(const GaussianParameters& p, const RenderConfig& con
   const Floats largest = broadcast(kLargestColor);
   const Mask in_range =
       (abs(color.x) <= largest) & (abs(color.y) <= largest) & (abs(color.z) <= largest);
-  if ((visible & ~to_bits(in_range)) != 0) *params_valid = false;
+  if ((visible & ~to_bits(in_range)) != 0) *faults |= kWrongParameter;
   store_projected(o, log2_opacity, cutoff_radius_sq, color, visible,
                   frame.projected.data() + group);
   store(depths, o.z);
@@ -163,13 +178,13 @@ std::uint32_t depth_key(float depth) {
 template <int Degree>
 std::int64_t project_degree(const GaussianParameters& p, const RenderConfig& config,
                             std::int64_t first, std::int64_t last, Frame& frame,
-                            std::uint64_t* sort_keys, bool* params_valid) {
+                            std::uint64_t* sort_keys, std::uint32_t* faults) {
   std::int64_t visible_count = 0;
   for (std::int64_t group = first; group < last; group += 16) {
     const int lanes = last - group < 16 ? static_cast<int>(last - group) : 16;
     alignas(64) float depths[16];
     const std::uint32_t visible =
-        project_group<Degree>(p, config, group, lanes, frame, depths, params_valid);
+        project_group<Degree>(p, config, group, lanes, frame, depths, faults);
     frame.visible[static_cast<std::size_t>(group / 16)] = static_cast<std::uint16_t>(visible);
     for (std::uint32_t remaining = visible; remaining != 0; remaining &= remaining - 1) {
       const int i = __builtin_ctz(remaining);
@@ -186,16 +201,16 @@ std::int64_t project_degree(const GaussianParameters& p, const RenderConfig& con
 
 std::int64_t project(const GaussianParameters& p, const RenderConfig& config, std::int64_t first,
                      std::int64_t last, Frame& frame, std::uint64_t* sort_keys,
-                     bool* params_valid) {
+                     std::uint32_t* faults) {
   switch (config.sh_degree) {
     case 0:
-      return project_degree<0>(p, config, first, last, frame, sort_keys, params_valid);
+      return project_degree<0>(p, config, first, last, frame, sort_keys, faults);
     case 1:
-      return project_degree<1>(p, config, first, last, frame, sort_keys, params_valid);
+      return project_degree<1>(p, config, first, last, frame, sort_keys, faults);
     case 2:
-      return project_degree<2>(p, config, first, last, frame, sort_keys, params_valid);
+      return project_degree<2>(p, config, first, last, frame, sort_keys, faults);
     default:
-      return project_degree<3>(p, config, first, last, frame, sort_keys, params_valid);
+      return project_degree<3>(p, config, first, last, frame, sort_keys, faults);
   }
 }
 

@@ -68,7 +68,7 @@ XRGS_INLINE ConicGradient conic_factor_backward(const Projection& o, const Float
 XRGS_INLINE void covariance_backward(const Projection& o, const RenderConfig& config,
                                      const GaussianInputs& in, ConicGradient v, Floats& v_opacity,
                                      Vector3& v_m_x, Vector3& v_m_y) {
-  const Floats zero = broadcast(0.0f), half = broadcast(0.5f), eps = broadcast(config.eps2d);
+  const Floats zero = broadcast(0.0f), half = broadcast(0.5f);
   Floats v_sqrt_det2d_ratio = zero;  // dL/d(sqrt_det2d) / sqrt_det2d
   if (config.antialiased) {
     const Floats inv_root = broadcast(1.0f) / sqrt(max(o.det, broadcast(1e-37f)));
@@ -77,8 +77,8 @@ XRGS_INLINE void covariance_backward(const Projection& o, const RenderConfig& co
         select(zero < o.sqrt_det2d, v_opacity * in.opacity * inv_root / o.sqrt_det2d, zero);
     v_opacity = v_opacity * o.sqrt_det2d * inv_root;
   }
-  v.xx = fma(eps, v.det, v.xx);
-  v.yy = fma(eps, v.det, v.yy);
+  v.xx = fma(o.eps, v.det, v.xx);
+  v.yy = fma(o.eps, v.det, v.yy);
   const Vector3 v_normal = times(fma(broadcast(2.0f), v.det, v_sqrt_det2d_ratio), o.normal);
   v_m_x = add_scaled(add_scaled(cross(o.m_y, v_normal), v.xx + v.xx, o.m_x), v.xy, o.m_y);
   v_m_y = add_scaled(add_scaled(cross(v_normal, o.m_x), v.yy + v.yy, o.m_y), v.xy, o.m_x);
@@ -98,6 +98,26 @@ XRGS_INLINE void quaternion_backward(const Rotation& r, const Vector3 (&v)[3], F
   out[1] = r.inv_length * fnma(along, r.x, x);
   out[2] = r.inv_length * fnma(along, r.y, y);
   out[3] = r.inv_length * fnma(along, r.z, z);
+  if (any(r.tiny))
+    for (int i = 0; i < 4; ++i) out[i] = select(r.tiny, broadcast(kTinyScale) * out[i], out[i]);
+}
+
+// Changes sums over pixels to those in the pixels of huge Gaussians.
+XRGS_INLINE void to_huge_pixels(Floats unit, Floats (&sum)[16]) {
+  sum[kGradDy] = unit * sum[kGradDy];
+  sum[kGradUDy] = unit * sum[kGradUDy];
+  sum[kGradDyDy] = unit * (unit * sum[kGradDyDy]);
+}
+
+// Changes a projection and the gradients of its rows of M and of its mean to those in pixels.
+XRGS_INLINE void to_pixels(Projection& o, ConicGradient& v, Vector3& v_m_x, Vector3& v_m_y) {
+  const Floats inv_unit = select(o.huge, broadcast(kHugePixel), broadcast(1.0f));
+  o.m_x = times(inv_unit, o.m_x);
+  o.m_y = times(inv_unit, o.m_y);
+  v_m_x = times(o.unit, v_m_x);
+  v_m_y = times(o.unit, v_m_y);
+  v.mean_x = o.unit * v.mean_x;
+  v.mean_y = o.unit * v.mean_y;
 }
 
 struct GeometryGradient {
@@ -269,11 +289,13 @@ bool backward_group(const GaussianParameters& p, const Frame& frame, const float
   Floats sum[16];
   sum_pair_grads(frame, pair_grads, group, visible, sum);
   const GaussianInputs in = load_inputs(p, config.raw, group, lanes);
-  const Projection o = project_inputs(in, config);
-  const ConicGradient v = conic_factor_backward(o, sum);
+  Projection o = project_inputs(in, config);
+  if (any(o.huge)) to_huge_pixels(o.unit, sum);
+  ConicGradient v = conic_factor_backward(o, sum);
   Floats v_opacity = sum[kGrad] / o.opacity;  // Eq. 19
   Vector3 v_m_x, v_m_y;
   covariance_backward(o, config, in, v, v_opacity, v_m_x, v_m_y);
+  if (any(o.huge)) to_pixels(o, v, v_m_x, v_m_y);
   GeometryGradient geometry = projection_backward(o, config, in, v_m_x, v_m_y, v.mean_x, v.mean_y);
   const ColorDerivatives& derivatives =
       frame.color_derivatives[static_cast<std::size_t>(group / 16)];

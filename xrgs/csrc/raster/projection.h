@@ -15,6 +15,10 @@ constexpr float kClampMargin = 0.3f;
 // From this depth on, in world units, a Gaussian is not visible: the reciprocal would be denormal.
 constexpr float kDepthEnd = 8e37f;
 
+// Where the determinant of the 2D covariance is this or more, px^4, the image plane is measured in
+// pixels of 2^32 px: neither the determinant nor the gradient by it leaves the range of float32.
+constexpr float kHugeDet = 1e30f, kHugePixel = 4294967296.0f;
+
 struct Vector3 {
   Floats x, y, z;
 };
@@ -71,11 +75,27 @@ XRGS_INLINE GaussianInputs load_inputs(const GaussianParameters& p, bool raw, st
 }
 
 // A unit quaternion, its rotation matrix, and 1 / the length of the quaternion before
-// normalisation.
+// normalisation. Where it is tiny, inv_length is that of kTinyScale times the quaternion.
 struct Rotation {
   Floats w, x, y, z, inv_length;
+  Mask tiny;
   Vector3 row[3];
 };
+
+constexpr float kSmallestNormal = 1.17549435e-38f;
+
+// Quaternions whose components are all below the first number are multiplied by the second, 2^64.
+constexpr float kTinyQuaternion = 1.0842022e-19f, kTinyScale = 18446744073709551616.0f;
+
+// kTinyScale times a tiny number. Denormal numbers, which arithmetic takes for zeros, are read as
+// what they are, the multiple of 2^-149 that their bits say.
+XRGS_INLINE Floats scale_tiny(Floats a) {
+  const Floats unit = broadcast(2.5849394e-26f);  // kTinyScale 2^-149
+  const Floats sign = to_floats(shift_right<31>(as_ints(a)));  // 0 or -1
+  const Floats denormal = unit * to_floats(as_ints(abs(a)));
+  return select(abs(a) < broadcast(kSmallestNormal), fma(sign + sign, denormal, denormal),
+                broadcast(kTinyScale) * a);
+}
 
 // The zero quaternion is read as the identity, and its inv_length is zero, so it has no gradient.
 XRGS_INLINE Rotation quat_to_rotation(const GaussianInputs& in) {
@@ -83,15 +103,23 @@ XRGS_INLINE Rotation quat_to_rotation(const GaussianInputs& in) {
   // range.
   // Both are divided by four before, as the reciprocal of the largest numbers is denormal.
   const Floats one = broadcast(1.0f), quarter = broadcast(0.25f);
-  const Floats largest = max(max(abs(in.qw), abs(in.qx)), max(abs(in.qy), abs(in.qz)));
-  const Mask zero =
-      largest < broadcast(1.0842022e-19f);  // the square root of the smallest normal number
-  const Floats inv_largest = one / (quarter * select(zero, one, largest));
+  Floats qw = in.qw, qx = in.qx, qy = in.qy, qz = in.qz;
+  Floats largest = max(max(abs(qw), abs(qx)), max(abs(qy), abs(qz)));
   Rotation r;
-  r.w = select(zero, one, quarter * in.qw * inv_largest);
-  r.x = select(zero, broadcast(0.0f), quarter * in.qx * inv_largest);
-  r.y = select(zero, broadcast(0.0f), quarter * in.qy * inv_largest);
-  r.z = select(zero, broadcast(0.0f), quarter * in.qz * inv_largest);
+  r.tiny = largest < broadcast(kTinyQuaternion);
+  if (any(r.tiny)) {
+    qw = select(r.tiny, scale_tiny(qw), qw);
+    qx = select(r.tiny, scale_tiny(qx), qx);
+    qy = select(r.tiny, scale_tiny(qy), qy);
+    qz = select(r.tiny, scale_tiny(qz), qz);
+    largest = max(max(abs(qw), abs(qx)), max(abs(qy), abs(qz)));
+  }
+  const Mask zero = largest == broadcast(0.0f);
+  const Floats inv_largest = one / (quarter * select(zero, one, largest));
+  r.w = select(zero, one, quarter * qw * inv_largest);
+  r.x = select(zero, broadcast(0.0f), quarter * qx * inv_largest);
+  r.y = select(zero, broadcast(0.0f), quarter * qy * inv_largest);
+  r.z = select(zero, broadcast(0.0f), quarter * qz * inv_largest);
   const Floats inv = one / sqrt(fma(r.w, r.w, fma(r.x, r.x, fma(r.y, r.y, r.z * r.z))));
   r.inv_length = select(zero, broadcast(0.0f), quarter * inv * inv_largest);
   r.w = r.w * inv;
@@ -115,11 +143,14 @@ struct Projection {
   Vector3 m_x, m_y;       // the rows of M = J A, px (Eq. 4)
   Vector3 normal;         // m_x cross m_y
   Floats xx, xy, yy;      // the dilated 2D covariance, px^2 (Eq. 5)
+  Floats eps;             // eps2d, px^2
   Floats sqrt_det2d;      // |normal|: root of the determinant before dilation
   Floats det;             // of the dilated covariance (Eq. 6)
   Floats opacity;         // compensated if antialiased (Eq. 10)
   Floats mean_x, mean_y;  // px (Eq. 2)
   Mask in_front;          // of the near plane, and nearer than kDepthEnd
+  Mask huge;              // where m_x, m_y and what follows from them are in pixels of kHugePixel
+  Floats unit;            // 1 / kHugePixel there, elsewhere 1
 };
 
 // Clamps a slope to the field of view and a margin (Eq. 3); `size` is the width or height in px.
@@ -130,6 +161,17 @@ XRGS_INLINE Floats clamp_slope(Floats slope, float focal, float centre, float si
   const Floats low = broadcast(-before - margin), high = broadcast(after + margin);
   unclamped = (low <= slope) & (slope <= high);
   return clamp(slope, low, high);
+}
+
+// Sets what follows from m_x, m_y and eps (Eq. 5 and 6).
+XRGS_INLINE void set_covariance(Projection& o) {
+  o.normal = cross(o.m_x, o.m_y);
+  const Floats xx = dot(o.m_x, o.m_x), yy = dot(o.m_y, o.m_y), det2d = dot(o.normal, o.normal);
+  o.sqrt_det2d = sqrt(det2d);
+  o.det = det2d + fma(o.eps, xx + yy, o.eps * o.eps);
+  o.xx = xx + o.eps;
+  o.xy = dot(o.m_x, o.m_y);
+  o.yy = yy + o.eps;
 }
 
 XRGS_INLINE Projection project_inputs(const GaussianInputs& in, const RenderConfig& config) {
@@ -161,15 +203,17 @@ XRGS_INLINE Projection project_inputs(const GaussianInputs& in, const RenderConf
   }
   o.m_x = times(focal_x, add_scaled(o.axis[0], -o.slope_x, o.axis[2]));
   o.m_y = times(focal_y, add_scaled(o.axis[1], -o.slope_y, o.axis[2]));
-  o.normal = cross(o.m_x, o.m_y);
-
-  const Floats eps = broadcast(config.eps2d);
-  const Floats xx = dot(o.m_x, o.m_x), yy = dot(o.m_y, o.m_y), det2d = dot(o.normal, o.normal);
-  o.sqrt_det2d = sqrt(det2d);
-  o.det = det2d + fma(eps, xx + yy, eps * eps);
-  o.xx = xx + eps;
-  o.xy = dot(o.m_x, o.m_y);
-  o.yy = yy + eps;
+  o.eps = broadcast(config.eps2d);
+  set_covariance(o);
+  o.huge = broadcast(kHugeDet) <= o.det;
+  o.unit = broadcast(1.0f);
+  if (any(o.huge)) {
+    o.unit = select(o.huge, broadcast(1.0f / kHugePixel), o.unit);
+    o.m_x = times(o.unit, o.m_x);
+    o.m_y = times(o.unit, o.m_y);
+    o.eps = o.unit * o.unit * o.eps;
+    set_covariance(o);
+  }
   o.opacity = in.opacity;
   if (config.antialiased)
     o.opacity = in.opacity * (o.sqrt_det2d / sqrt(max(o.det, broadcast(1e-37f))));

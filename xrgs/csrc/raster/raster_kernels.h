@@ -16,11 +16,11 @@ struct Frame;
 struct RasterKernels {
   // Projects Gaussians first..last-1 (first a multiple of 16). Writes frame.projected, visible,
   // color_derivatives and pair_ranges (zeros), and the depth sort keys of the visible Gaussians to
-  // sort_keys. Sets *params_valid to false where a parameter that it read is not finite or out of
+  // sort_keys. Sets bits of *faults where a parameter that it read is not finite or out of
   // range (shN is read for visible Gaussians only). Returns the number of visible Gaussians.
   std::int64_t (*project)(const GaussianParameters& parameters, const RenderConfig& config,
                           std::int64_t first, std::int64_t last, Frame& frame,
-                          std::uint64_t* sort_keys, bool* params_valid);
+                          std::uint64_t* sort_keys, std::uint32_t* faults);
 
   // Writes the (tile, Gaussian) pairs of frame.order[*next..last-1] to `intersections`, adds their
   // number for each tile to tile_counts, and sets it for each Gaussian in frame.pair_ranges. Stops

@@ -60,9 +60,9 @@ void compact_sort_keys(int threads, std::int64_t chunks, const std::int32_t* vis
   });
 }
 
-// Projects all Gaussians. Returns false where a parameter is not valid.
-bool project_chunks(int threads, const RasterKernels& kernels, const GaussianParameters& p,
-                    Frame& frame, Workspace& workspace) {
+// Projects all Gaussians. Returns the bits of what is wrong with them.
+std::uint32_t project_chunks(int threads, const RasterKernels& kernels,
+                             const GaussianParameters& p, Frame& frame, Workspace& workspace) {
   const std::size_t count = static_cast<std::size_t>(p.count);
   frame.gaussian_count = p.count;
   frame.projected.resize(count);
@@ -74,16 +74,16 @@ bool project_chunks(int threads, const RasterKernels& kernels, const GaussianPar
   const std::int64_t chunks = (p.count + kProjectChunk - 1) / kProjectChunk;
   std::int32_t* visible_counts =
       workspace.chunk_visible_counts.resize(static_cast<std::size_t>(chunks));
-  std::atomic<bool> all_valid{true};
+  std::atomic<std::uint32_t> all_faults{0};
   parallel_for(threads, chunks, [&](std::int64_t c) {
     const std::int64_t first = c * kProjectChunk, last = std::min(p.count, first + kProjectChunk);
-    bool params_valid = true;
+    std::uint32_t faults = 0;
     visible_counts[c] = static_cast<std::int32_t>(kernels.project(
-        p, frame.config, first, last, frame, frame.order_buffer.data() + first, &params_valid));
-    if (!params_valid) all_valid = false;
+        p, frame.config, first, last, frame, frame.order_buffer.data() + first, &faults));
+    if (faults != 0) all_faults |= faults;
   });
   compact_sort_keys(threads, chunks, visible_counts, frame);
-  return all_valid;
+  return all_faults.load();
 }
 
 // Calls body(tile) for every tile: several that are side by side in one task, because neighbours
@@ -115,15 +115,16 @@ void for_each_tile(int threads, const Frame& frame, Body&& body) {
 
 }  // namespace
 
-bool render(int threads, const GaussianParameters& parameters, const RenderConfig& config,
-            Frame& frame, float* image, float* alpha) {
+std::uint32_t render(int threads, const GaussianParameters& parameters, const RenderConfig& config,
+                     Frame& frame, float* image, float* alpha) {
   const RasterKernels& kernels = XRGS_SELECT(raster_kernels);
   frame.rendered = false;
   ScopedWorkspace workspace;
   frame.config = config;
   frame.visible_count = 0;
   StageTimer timer;
-  if (!project_chunks(threads, kernels, parameters, frame, *workspace)) return false;
+  const std::uint32_t faults = project_chunks(threads, kernels, parameters, frame, *workspace);
+  if (faults != 0) return faults;
   frame.timings.project = timer.elapsed_ms();
   sort_by_depth(threads, frame, *workspace);
   frame.timings.sort = timer.elapsed_ms();
@@ -132,7 +133,7 @@ bool render(int threads, const GaussianParameters& parameters, const RenderConfi
   for_each_tile(threads, frame, [&](int tile) { kernels.composite(frame, tile, image, alpha); });
   frame.timings.composite = timer.elapsed_ms();
   frame.rendered = true;
-  return true;
+  return 0;
 }
 
 bool render_backward(int threads, const GaussianParameters& parameters, Frame& frame,

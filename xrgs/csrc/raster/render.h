@@ -6,11 +6,12 @@
 
 namespace xrgs {
 
-// Renders into image [H, W, 3] and alpha [H, W], and sets frame.rendered. Returns false, with
-// nothing rendered, where a parameter is not finite or out of range. Throws std::bad_alloc. In both
-// cases frame.rendered is false, and the frame can be rendered into again.
-bool render(int threads, const GaussianParameters& parameters, const RenderConfig& config,
-            Frame& frame, float* image, float* alpha);
+// Renders into image [H, W, 3] and alpha [H, W], and sets frame.rendered. Returns 0, or, with nothing
+// rendered, the bits of what is wrong: kWrongParameter, kTooLarge. Throws std::bad_alloc. Where it
+// throws or returns another number than 0, frame.rendered is false, and the frame can be rendered
+// into again.
+std::uint32_t render(int threads, const GaussianParameters& parameters, const RenderConfig& config,
+                     Frame& frame, float* image, float* alpha);
 
 // Writes the gradients of the parameters, given those of image and alpha, and returns whether all
 // of them are finite. The parameters must be the ones that were rendered into the frame. Throws

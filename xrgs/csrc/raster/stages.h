@@ -10,7 +10,7 @@ namespace XRGS_NS {
 
 std::int64_t project(const GaussianParameters& parameters, const RenderConfig& config,
                      std::int64_t first, std::int64_t last, Frame& frame, std::uint64_t* sort_keys,
-                     bool* params_valid);
+                     std::uint32_t* faults);
 std::int64_t intersect_tiles(Frame& frame, std::int64_t* next, std::int64_t last,
                              TileIntersection* intersections, std::int64_t capacity,
                              std::uint32_t* tile_counts);

@@ -54,6 +54,10 @@ struct RenderConfig {
   std::int64_t tile_count() const { return std::int64_t{tile_columns()} * tile_rows(); }
 };
 
+// Why a render has no image.
+constexpr std::uint32_t kWrongParameter = 1;  // not finite or out of range
+constexpr std::uint32_t kTooLarge = 2;        // a Gaussian is larger than float32 can hold, in px
+
 // The Gaussians: float32, contiguous; scales and opacities as RenderConfig::raw says.
 struct GaussianParameters {
   std::int64_t count;           // N

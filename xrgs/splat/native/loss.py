@@ -11,7 +11,7 @@ from xrgs import _native
 from xrgs.splat.native.arguments import handle, require_float32
 from xrgs.splat.ssim import WEIGHTS, Target
 
-_WINDOW = torch.tensor(WEIGHTS, dtype=torch.float64)
+_WINDOW = torch.tensor(WEIGHTS, dtype=torch.float64, device="cpu")
 
 
 def target_moments(image: Tensor) -> tuple[Tensor, Tensor]:

@@ -37,6 +37,7 @@ _COEFFICIENTS = torch.tensor(
         for n in range(MOST_SHARES + 1)
     ],
     dtype=torch.float64,
+    device="cpu",
 )
 """The coefficient of o^m in `share_out` for n shares [n, m - 1]."""
 

@@ -20,13 +20,16 @@ CLAMP_MARGIN = 0.3
 """Share of half the field of view by which the point of the Jacobian may lie outside the image
 (gsplat: within 1.3 tan(fov / 2))."""
 
+LARGEST = 1e18
+"""Half a side of the largest bounding box of a Gaussian that is rendered, px."""
+
 
 class ProjectedGaussians(NamedTuple):
     """Gaussians in the image plane."""
 
     means2d: Tensor  # [M, 2] px
     cov: Tensor  # [M, 3] xx, xy, yy of the dilated covariance, px^2
-    det: Tensor  # [M] determinants of these covariances, px^4
+    det: Tensor  # [M] determinants of these covariances, px^4; float64 where float32 overflows
     opacities: Tensor  # [M], compensated for the dilation if antialiased
     depths: Tensor  # [M] world units
 
@@ -84,15 +87,27 @@ def project(
     row_x = (fx / z)[:, None] * (axes[:, 0] - tan_x[:, None] * axes[:, 2])  # [M, 3], first row of M
     row_y = (fy / z)[:, None] * (axes[:, 1] - tan_y[:, None] * axes[:, 2])  # [M, 3], second row
 
-    # det(M M^T + eps I), expanded so that nothing cancels: xx yy - xy^2 does in float32.
     eps = settings.eps2d
     xx, xy, yy = (row_x * row_x).sum(-1), (row_x * row_y).sum(-1), (row_y * row_y).sum(-1)  # [M]
-    area = torch.linalg.vector_norm(torch.linalg.cross(row_x, row_y), dim=-1)  # sqrt(det(M M^T))
-    det = area * area + eps * (xx + yy) + eps * eps  # [M]
+    area, det = _area_and_determinant(row_x, row_y, eps)
+    if not torch.isfinite(det).all():  # of a Gaussian larger than 4e9 px, in float32
+        area, det = _area_and_determinant(row_x.double(), row_y.double(), eps)
+        overflows = ~torch.isfinite(det)  # `visible_by_depth` refuses these, if they are drawn
+        area, det = area.masked_fill(overflows, 1.0), det.masked_fill(overflows, 1.0)
     if settings.antialiased:
-        opacities = opacities * area / det.sqrt()
+        opacities = (opacities * area / det.sqrt()).to(opacities)
     cov = torch.stack([xx + eps, xy, yy + eps], dim=-1)  # [M, 3]
     return ProjectedGaussians(means2d, cov, det, opacities, z)
+
+
+def _area_and_determinant(row_x: Tensor, row_y: Tensor, eps: float) -> tuple[Tensor, Tensor]:
+    """Return sqrt(det(M M^T)) and det(M M^T + eps I), for the rows of M.
+
+    It is expanded so that nothing cancels: xx yy - xy^2 does in float32.
+    """
+    xx, yy = (row_x * row_x).sum(-1), (row_y * row_y).sum(-1)  # [M]
+    area = torch.linalg.vector_norm(torch.linalg.cross(row_x, row_y), dim=-1)
+    return area, area * area + eps * (xx + yy) + eps * eps
 
 
 def _clamp_tangent(tangent: Tensor, before: Tensor, after: Tensor) -> Tensor:
@@ -130,16 +145,20 @@ def visible_by_depth(
 
     Returns:
         [M] indices, front to back; equal depths keep the order of their indices.
+
+    Raises:
+        ValueError: A Gaussian is larger than `LARGEST`.
     """
     radius_sq = cutoff_radius_sq(projected.opacities, settings)  # [N]
     # Half the bounding box of the ellipse: the radius times the standard deviation of each axis.
     extent = (radius_sq.clamp_min(0)[:, None] * projected.cov[:, [0, 2]]).sqrt()  # [N, 2] px
     low, high = projected.means2d - extent, projected.means2d + extent
     size = torch.tensor([camera.width, camera.height])
-    # A covariance that overflows, or is singular for want of dilation, has no inverse.
-    det = projected.det
-    invertible = torch.isfinite(det) & (det > 0) & torch.isfinite(extent).all(-1)
-    visible = invertible & (radius_sq >= 0) & ((high > 0) & (low < size)).all(-1)  # [N]
+    is_drawn = (radius_sq >= 0) & torch.isfinite(projected.means2d).all(-1)
+    if not (extent[is_drawn] < LARGEST).all():
+        raise ValueError(f"scales: a Gaussian is larger than {LARGEST:.0e} px in the image")
+    # A covariance that is singular for want of dilation has no inverse.
+    visible = is_drawn & (projected.det > 0) & ((high > 0) & (low < size)).all(-1)  # [N]
     order = torch.argsort(projected.depths, stable=True)
     return order[visible[order]]
 
@@ -160,4 +179,4 @@ def conic_cholesky(projected: ProjectedGaussians) -> Tensor:
     c_xx = (yy / projected.det / 2).sqrt()
     c_xy = -(c_xx * xy / yy)
     c_yy = (0.5 / yy).sqrt()
-    return torch.stack([c_xx, c_xy, c_yy], dim=-1)
+    return torch.stack([c_xx.to(c_yy), c_xy.to(c_yy), c_yy], dim=-1)
