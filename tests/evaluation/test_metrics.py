@@ -250,7 +250,7 @@ def test_a_colour_map_of_the_photograph_costs_nothing_after_a_fit() -> None:
 def test_cc_psnr_of_gsplat_is_another_number() -> None:
     """gsplat 1.6.0, color_correct_affine: a line per channel from photograph to render, inverted."""
     _, target = pair()
-    image = target @ torch.tensor([[0.6, 0.1, 0.0], [0.0, 0.8, 0.1], [0.1, 0.0, 0.7]])
+    image = target @ torch.tensor([[0.5, 0.4, 0.1], [0.1, 0.5, 0.4], [0.4, 0.1, 0.5]])
     corrected = torch.empty_like(image)
     for channel in range(3):
         render, photo = (of[..., channel].double().numpy() for of in (image, target))

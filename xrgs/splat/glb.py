@@ -110,7 +110,7 @@ def _attributes(gaussians: Gaussians) -> dict[str, Array]:
     means, quats, scales, opacities, sh0, shN = (
         gaussians[name].detach().double().numpy() for name in PARAMETERS
     )
-    with np.errstate(over="ignore"):  # an infinite scale is refused by name
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused by name
         alpha = 1 / (1 + np.exp(-opacities))
         linear = {"SCALE": np.exp(scales), "ROTATION": quats[:, [1, 2, 3, 0]], "OPACITY": alpha}
         attributes = {f"{EXTENSION}:{name}": values for name, values in linear.items()}
@@ -118,11 +118,8 @@ def _attributes(gaussians: Gaussians) -> dict[str, Array]:
         for name, at in _harmonics(sh.shape[1]).items():
             attributes[name] = sh[:, at]
         floats = {name: values.astype("<f4") for name, values in attributes.items()}
-    return {
-        "POSITION": means.astype("<f4"),
-        **floats,
-        "COLOR_0": _fallback_colors(sh0[:, 0], alpha),
-    }
+        colors = _fallback_colors(sh0[:, 0], alpha)
+    return {"POSITION": means.astype("<f4"), **floats, "COLOR_0": colors}
 
 
 def _harmonics(count: int) -> dict[str, int]:

@@ -61,14 +61,7 @@ _MAX_UNPACKED = 200  # times the size of the file; gzip packs zeros 1000 times s
 _EXTENSION = struct.Struct("<II")  # its type, and the bytes of its content
 _MAX_EXTENSIONS = 1 << 20  # bytes
 _AXES_EXTENSION = 0xADBE0003
-#: The axes by their number in the extension, from 1: the direction of x, y and z each.
-_AXES = (
-    *("LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF"),
-    *("LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU"),
-)
-#: Directions in the world of .ply files.
-_DIRECTIONS = {"R": (1, 0, 0), "L": (-1, 0, 0), "D": (0, 1, 0), "U": (0, -1, 0)}
-_DIRECTIONS |= {"F": (0, 0, 1), "B": (0, 0, -1)}
+_MOST_AXES = 16
 
 
 def write_spz(path: Path, gaussians: Gaussians, *, antialiased: bool = False) -> None:
@@ -181,41 +174,47 @@ def _read(path: Path, content: bytes) -> SavedGaussians:
         extensions = stream.decompress(stream.unconsumed_tail, _MAX_EXTENSIONS)
     if len(body) != size:
         raise ValueError(f"has {len(body)} of its {size} bytes")
-    axes = _named_axes(path, extensions) if flags & _EXTENDED else None
+    axes = _named_axes(path, extensions) if flags & _EXTENDED else 0
     if degree > MAX_DEGREE:
         _log.warning("%s: bands of the harmonics above %d are left out", path, MAX_DEGREE)
     ends = np.cumsum([count * width for width in widths])[:-1]
     parts = np.split(np.frombuffer(body, np.uint8), ends)
     rows = [part.reshape(count, width) for part, width in zip(parts, widths, strict=True)]
     read = to_gaussians(_unpacked(rows, version, fraction))
-    if axes is not None:
+    if axes:
         read = transformed(read, _to_ply(axes))
     return SavedGaussians(read, bool(flags & _ANTIALIASED))
 
 
-def _named_axes(path: Path, extensions: bytes) -> str | None:
-    """Return the axes that extensions name; None where they name none."""
-    axes, at = None, 0
+def _named_axes(path: Path, extensions: bytes) -> int:
+    """Return the number of the axes that extensions name; 0 where they name none."""
+    axes, at = 0, 0
     while at + _EXTENSION.size <= len(extensions):
         kind, length = _EXTENSION.unpack_from(extensions, at)
         at += _EXTENSION.size + length
+        if at > len(extensions):
+            raise ValueError("ends within an extension")
         if kind != _AXES_EXTENSION:
             _log.warning("%s: has the extension %#010x, which is not read", path, kind)
             continue
-        number = int.from_bytes(extensions[at - length : at][:4], "little")
-        if length != 4 or number > len(_AXES):
-            raise ValueError(f"its extension {kind:#x} names the axes number {number}")
-        if number == 0:
-            _log.warning("%s: leaves its axes unspecified; they are taken as they are", path)
-        else:
-            axes = _AXES[number - 1]
+        axes = int.from_bytes(extensions[at - length : at], "little")
+        if length != 4 or axes > _MOST_AXES:
+            raise ValueError(f"its extension {kind:#x} names axes {axes}, not 0 to {_MOST_AXES}")
     return axes
 
 
-def _to_ply(axes: str) -> NDArray[np.float64]:
-    """Return the matrix [4, 4] from a world of named axes to one of right, down, forward."""
-    matrix = np.eye(4)
-    matrix[:3, :3] = np.transpose([_DIRECTIONS[axis] for axis in axes])
+def _to_ply(axes: int) -> NDArray[np.float64]:
+    """Return the matrix [4, 4] from a world of named axes to one of right, down, forward.
+
+    As Niantic's library turns: bits of the number less 1 are whether x points right, y up and z
+    forward, and whether a quarter turn about x is between. From 9 on, the library's names of the
+    axes fit its turns in four of eight cases only; its files are as it turns.
+    """
+    bits = axes - 1
+    signs = [1 if bits & 1 else -1, -1 if bits & 2 else 1, 1 if bits & 4 else -1, 1]
+    matrix = np.diag(np.array(signs, np.float64))
+    if bits & 8:
+        matrix = matrix[[0, 2, 1, 3]] * [[1], [1], [-1], [1]]
     return matrix
 
 
