@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[1]
 def test_the_tables_of_the_documentation_are_what_the_programs_read() -> None:
     """The versions are in the script. XRGS_INTERCHANGE names a folder that keeps the programs."""
     kept = os.environ.get("XRGS_INTERCHANGE")
-    command = [sys.executable, ROOT / "benchmarks/interchange/compare.py"]
+    command = [sys.executable, str(ROOT / "benchmarks/interchange/compare.py")]
     command += ["--folder", kept] if kept else []
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
