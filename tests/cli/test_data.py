@@ -201,7 +201,7 @@ def test_the_splats_of_a_cell_render_the_same_from_every_format(
         assert wanted.std() > 0.005
         assert (got - wanted).abs().mean() <= tolerance * wanted.mean()
     if form == "glb":  # the cameras' mean up direction is glTF's +y
-        description = (tmp_path / f"{folder.name}.glb").read_bytes()[20:].split(b'"rotation":')[1]
+        description = (tmp_path / f"{folder.name}.glb").read_bytes()[20:].split(b'"turned_by":')[1]
         turn = Rotation.from_quat(json.loads(description.split(b"]")[0] + b"]"))
         ups = [-view.camera.viewmat[1, :3].numpy() for view in cell.dataset().train]
         up = np.mean(ups, axis=0)

@@ -247,6 +247,22 @@ def test_a_colour_map_of_the_photograph_costs_nothing_after_a_fit() -> None:
     assert flat == pytest.approx(-10 * math.log10(centred.square().mean()), abs=1e-4)
 
 
+def test_cc_psnr_of_gsplat_is_another_number() -> None:
+    """gsplat 1.6.0, color_correct_affine: a line a channel from photograph to render, inverted."""
+    _, target = pair()
+    image = target @ torch.tensor([[0.5, 0.4, 0.1], [0.1, 0.5, 0.4], [0.4, 0.1, 0.5]])
+    corrected = torch.empty_like(image)
+    for channel in range(3):
+        render, photo = (of[..., channel].double().numpy() for of in (image, target))
+        slope, offset = np.polyfit(photo.ravel(), render.ravel(), 1)
+        corrected[..., channel] = torch.from_numpy((render - offset) / slope).clamp(0, 1)
+    theirs, ours = metrics.psnr(corrected, target), metrics.psnr_fitted(image, target)
+    assert theirs is not None
+    assert ours is not None
+    assert theirs < 30
+    assert ours > 120
+
+
 def test_ssim_inside_a_mask_is_the_mean_of_the_definition_there() -> None:
     (image, target), mask = pair(), half_mask()
     filled = torch.from_numpy(masks.filled(target.numpy(), mask.numpy()))

@@ -62,6 +62,19 @@ def test_each_image_has_a_mask_where_one_has(tmp_path: Path) -> None:
         assert frame["mask_path"] == frame["file_path"].replace("images/", "masks/") + ".png"
 
 
+def test_the_split_is_where_other_programs_look_for_it(tmp_path: Path) -> None:
+    """3DGS reads sparse/0/test.txt; nerfbaselines 1.2.12 train_list.txt and test_list.txt in the
+    folder; nerfstudio 1.1.5 asks for val_list.txt beside them, and fails without it."""
+    out = tmp_path / "out"
+    export(masked_variant(tmp_path).folder, "colmap", out)
+    train, test = "train_v0.png\ntrain_v1.png\n", "test_v2.png\n"
+    assert (out / "train_list.txt").read_text() == train
+    assert (out / "val_list.txt").read_text() == test
+    assert (out / "test_list.txt").read_text() == test
+    assert (out / "sparse/0/test.txt").read_text() == test
+    assert set((train + test).split()) == {file.name for file in (out / "images").iterdir()}
+
+
 def test_without_masks_none_is_written(tmp_path: Path) -> None:
     variant = masked_variant(tmp_path)
     plain = tmp_path / "plain"

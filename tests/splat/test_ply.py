@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from plyfile import PlyData, PlyElement
 
 from xrgs.errors import XrgsError
 from xrgs.splat.cameras import Camera
+from xrgs.splat.files import load_gaussians, save_gaussians
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.splat.ply import load_ply, read_ply, save_ply
 from xrgs.splat.rendering import rasterize_parameters
@@ -33,7 +35,7 @@ def make(count: int = 5, degree: int = 3) -> Gaussians:
 @pytest.fixture
 def saved(tmp_path: Path) -> Path:
     path = tmp_path / "splats.ply"
-    save_ply(path, make())
+    save_ply(path, make(), exact=True)
     return path
 
 
@@ -41,13 +43,40 @@ def saved(tmp_path: Path) -> Path:
 @pytest.mark.parametrize("count", [0, 1, 7])
 def test_what_was_saved_is_loaded(tmp_path: Path, count: int, degree: int) -> None:
     gaussians = make(count, degree)
-    save_ply(tmp_path / "a.ply", gaussians)
+    save_ply(tmp_path / "a.ply", gaussians, exact=True)
     loaded = load_ply(tmp_path / "a.ply")
     for name in PARAMETERS:
         assert torch.equal(loaded[name], gaussians[name])
         assert loaded[name].is_leaf
         assert loaded[name].requires_grad
         assert loaded[name].is_contiguous()
+
+
+@pytest.mark.parametrize("suffix", ["ply", "glb", "spz"])
+@pytest.mark.parametrize("length", [1e-30, 1e-3, 1.0, 1e3, 1e30])
+def test_quaternions_are_written_as_unit_ones(tmp_path: Path, suffix: str, length: float) -> None:
+    gaussians = make(30)
+    with torch.no_grad():
+        gaussians.quats *= length
+        gaussians.quats[4] = 0
+        gaussians.shN.clamp_(-0.9, 0.9)
+    save_gaussians(tmp_path / f"a.{suffix}", gaussians)
+    read = load_gaussians(tmp_path / f"a.{suffix}").gaussians.quats.detach().double()
+    torch.testing.assert_close(read.norm(dim=1), torch.ones(30).double(), rtol=0, atol=1e-6)
+    wanted = make(30).quats.detach().double()
+    wanted[4] = torch.tensor([1.0, 0, 0, 0])  # as it is rendered
+    cosine = (read * wanted).sum(1).abs() / wanted.norm(dim=1) / read.norm(dim=1)
+    assert cosine.min() > (1 - 1e-6 if suffix == "spz" else 1 - 1e-13)
+
+
+@pytest.mark.parametrize("suffix", ["glb", "spz"])
+@pytest.mark.parametrize("name", PARAMETERS)
+def test_no_writer_that_converts_hides_nan(tmp_path: Path, suffix: str, name: str) -> None:
+    gaussians = make(4)
+    gaussians[name].detach()[2] = math.nan
+    with pytest.raises(XrgsError, match=r"of Gaussian 2 \(from 0\) is nan; it must be finite"):
+        save_gaussians(tmp_path / f"a.{suffix}", gaussians)
+    assert not any(tmp_path.iterdir())
 
 
 def test_layout_is_the_one_that_viewers_read(saved: Path) -> None:

@@ -213,14 +213,22 @@ def _write_images(data: Dataset, target: Path) -> list[PinholeImage]:
 
 
 def _write_colmap(data: Dataset, images: list[PinholeImage], target: Path) -> None:
-    """Write a binary model, and the list of test views that the trainer of 3DGS reads."""
+    """Write a binary model, and the split where other programs look for it.
+
+    The trainer of 3DGS reads `test.txt` in the model, nerfbaselines and nerfstudio's `colmap` read
+    a list of each split in the folder. nerfstudio asks for `val` while it trains.
+    """
     from xrgs.capture import colmap
 
     model = target / "sparse/0"
     model.mkdir(parents=True)
     colmap.write_model(model, images, *_points(data))
-    tests = [name for name, split, _ in _views(data) if split == "test"]
-    write_text(model / "test.txt", "".join(f"{name}\n" for name in tests))
+    lists = {"train": "", "test": ""}
+    for name, split, _ in _views(data):
+        lists[split] += f"{name}\n"
+    write_text(model / "test.txt", lists["test"])
+    for listed, split in (("train", "train"), ("val", "test"), ("test", "test")):
+        write_text(target / f"{listed}_list.txt", lists[split])
 
 
 def _write_nerfstudio(data: Dataset, images: list[PinholeImage], target: Path) -> None:

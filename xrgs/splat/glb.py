@@ -2,9 +2,11 @@
 
 Scales and opacities are stored after their activation functions, quaternions as unit xyzw, and the
 harmonics by coefficient, all as float32. glTF's y axis points up; that of .ply files points down.
+Gaussians are turned so, and their node not: programs differ in whether a node turns harmonics.
 
 The extension names no antialiased Gaussians and sorts by the distance from the camera, where 3D
-Gaussian Splatting sorts by depth. An own file says in `extras` that its Gaussians are antialiased.
+Gaussian Splatting sorts by depth. An own file says in `extras` that its Gaussians are antialiased,
+and how they were turned.
 """
 
 from __future__ import annotations
@@ -19,12 +21,13 @@ from scipy.spatial.transform import Rotation
 
 from xrgs.errors import XrgsError
 from xrgs.safeio.atomic import atomic_writer
+from xrgs.splat.gaussians import PARAMETERS
 from xrgs.splat.normalize import rotation_between
 from xrgs.splat.saved import (
     CERTAIN_LOGIT,
     FLAT_LOG_SCALE,
     SavedGaussians,
-    check_finite,
+    check_arrays_finite,
     to_gaussians,
 )
 from xrgs.splat.sh import C0, MAX_DEGREE, bases
@@ -51,7 +54,9 @@ _COMPONENTS = {5120: "i1", 5121: "u1", 5122: "i2", 5123: "u2", 5126: "f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 #: Half a turn about z: from y down, as in .ply files, to y up. SplatTransform turns them so.
 _DOWN_TO_UP = np.diag([-1.0, -1.0, 1.0])
-#: Says that a node's rotation is for display, and that the world of an own file is its mesh's.
+#: The quaternion xyzw by which an own file's Gaussians were turned from their world, in `extras`.
+_TURNED_BY = "turned_by"
+#: Up to version 0.2.0: the node is turned, which is only for display, and the Gaussians are not.
 _DISPLAY = "turned_for_display"
 
 
@@ -68,8 +73,7 @@ def write_glb(
         path: The file to write.
         gaussians: The Gaussians; at least one.
         antialiased: Whether they are to be rendered with `RasterSettings.antialiased`.
-        up: The direction [3] in their world that a rotation of the node turns to glTF's +y. The
-            Gaussians themselves are written as they are.
+        up: The direction [3] in their world that becomes glTF's +y; they are turned so.
 
     Raises:
         XrgsError: There are no Gaussians, they have scales that are not finite, or take 4 GB.
@@ -77,13 +81,15 @@ def write_glb(
     """
     if len(gaussians) == 0:
         raise XrgsError(f"{path}: glTF can't hold a model without Gaussians")
-    attributes = _attributes(gaussians)
-    for name, values in attributes.items():
-        check_finite(path, values.reshape(len(values), -1), [name] * values[0].size)
     start = np.asarray(up, np.float64)
-    turn = _DOWN_TO_UP @ rotation_between(start / np.linalg.norm(start), np.array([0.0, -1, 0]))
+    matrix = np.eye(4)
+    matrix[:3, :3] = _DOWN_TO_UP @ rotation_between(
+        start / np.linalg.norm(start), np.array([0.0, -1, 0])
+    )
+    attributes = _attributes(transformed(gaussians, matrix))
+    check_arrays_finite(path, attributes)
     content = [np.ascontiguousarray(values).tobytes() for values in attributes.values()]
-    description = _described(attributes, content, turn, antialiased)
+    description = _described(attributes, content, matrix[:3, :3], antialiased)
     text = json.dumps(description, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     size = sum(map(len, content))
@@ -100,33 +106,20 @@ def write_glb(
 
 
 def _attributes(gaussians: Gaussians) -> dict[str, Array]:
-    """Return the arrays of the mesh by the names of their attributes."""
+    """Return the arrays of the mesh by the names of their attributes; quaternions are unit ones."""
     means, quats, scales, opacities, sh0, shN = (
-        value.detach().double().numpy()
-        for value in (
-            gaussians.means,
-            gaussians.quats,
-            gaussians.scales,
-            gaussians.opacities,
-            gaussians.sh0,
-            gaussians.shN,
-        )
+        gaussians[name].detach().double().numpy() for name in PARAMETERS
     )
-    length = np.linalg.norm(quats, axis=1, keepdims=True)
-    unit = np.where(length > 0, quats, [1.0, 0, 0, 0]) / np.where(length > 0, length, 1.0)
-    with np.errstate(over="ignore"):  # an infinite scale is refused by name
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused by name
         alpha = 1 / (1 + np.exp(-opacities))
-        linear = {"SCALE": np.exp(scales), "ROTATION": unit[:, [1, 2, 3, 0]], "OPACITY": alpha}
+        linear = {"SCALE": np.exp(scales), "ROTATION": quats[:, [1, 2, 3, 0]], "OPACITY": alpha}
         attributes = {f"{EXTENSION}:{name}": values for name, values in linear.items()}
         sh = np.concatenate([sh0, shN], axis=1)  # [N, K, 3]
         for name, at in _harmonics(sh.shape[1]).items():
             attributes[name] = sh[:, at]
         floats = {name: values.astype("<f4") for name, values in attributes.items()}
-    return {
-        "POSITION": means.astype("<f4"),
-        **floats,
-        "COLOR_0": _fallback_colors(sh0[:, 0], alpha),
-    }
+        colors = _fallback_colors(sh0[:, 0], alpha)
+    return {"POSITION": means.astype("<f4"), **floats, "COLOR_0": colors}
 
 
 def _harmonics(count: int) -> dict[str, int]:
@@ -190,7 +183,7 @@ def _described(
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "rotation": quaternion, "extras": {_DISPLAY: True}}],
+        "nodes": [{"mesh": 0, "extras": {_TURNED_BY: quaternion}}],
         "meshes": [{"primitives": [primitive]}],
         "accessors": accessors,
         "bufferViews": views,
@@ -202,8 +195,8 @@ def read_glb(path: Path) -> SavedGaussians:
     """Read the Gaussians of a .glb file.
 
     They come back with the axes of .ply files, in which y points down: the transformation of their
-    node is applied, then half a turn about z. The rotation of an own file's node is for display
-    alone, so its Gaussians come back in the world that they were written from.
+    node is applied, then half a turn about z. The Gaussians of an own file come back in the world
+    that they were written from.
 
     Raises:
         XrgsError: The file can't be read, is damaged, or has no or several models of Gaussians, or
@@ -241,12 +234,13 @@ def _read(path: Path, content: bytes) -> SavedGaussians:
         for name, number in primitive["attributes"].items()
         if name == "POSITION" or name.startswith(f"{EXTENSION}:")
     }
-    for name, values in arrays.items():
-        check_finite(path, values, [name] * values.shape[1])
+    check_arrays_finite(path, arrays)
     gaussians = _gaussians(arrays)
-    if not description["nodes"][node].get("extras", {}).get(_DISPLAY):
+    own = description["nodes"][node].get("extras", {})
+    if not own.get(_DISPLAY):
         world = _to_world(description["nodes"], node)
-        world[:3] = _DOWN_TO_UP.T @ world[:3]
+        turn = Rotation.from_quat(own[_TURNED_BY]).as_matrix() if _TURNED_BY in own else _DOWN_TO_UP
+        world[:3] = turn.T @ world[:3]
         gaussians = transformed(gaussians, world)
     return SavedGaussians(gaussians, bool(extension.get("extras", {}).get("antialiased")))
 

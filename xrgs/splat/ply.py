@@ -25,6 +25,7 @@ from xrgs.splat.saved import (
     check_is_read,
     converted_by,
     to_gaussians,
+    unit_quaternions,
 )
 from xrgs.splat.sh import MAX_DEGREE, bases
 from xrgs.splat.torch_defaults import on_cpu_in_float32
@@ -51,17 +52,24 @@ _HIGHEST = 16
 
 @on_cpu_in_float32
 def save_ply(
-    path: str | Path, gaussians: Gaussians, *, antialiased: bool = False, durable: bool = True
+    path: str | Path,
+    gaussians: Gaussians,
+    *,
+    antialiased: bool = False,
+    durable: bool = True,
+    exact: bool = False,
 ) -> None:
     """Write Gaussians to a .ply file, which is replaced atomically.
 
     Args:
         path: The file to write.
         gaussians: The N Gaussians; they are written as little-endian float32, in raw parameters
-            (logarithms of scales, logits of opacities).
+            (logarithms of scales, logits of opacities) and unit quaternions.
         antialiased: Whether they were trained with `RasterSettings.antialiased`. The header then
             has the comment `SplatRenderMode: mip`, by which viewers know how to draw them.
         durable: Whether to wait until the content and the name are on the disk.
+        exact: Whether quaternions keep their length, so that the file has every bit of the
+            Gaussians. Some programs turn Gaussians whose quaternions are no unit ones.
 
     Raises:
         OSError: The file can't be written.
@@ -70,6 +78,7 @@ def save_ply(
         >>> save_ply("splats.ply", gaussians)
     """
     path = Path(path) if isinstance(path, str) else path
+    unit = torch.from_numpy(unit_quaternions(gaussians.quats))
     columns = [
         gaussians.means,
         torch.zeros_like(gaussians.means),  # normals, which viewers expect and do not use
@@ -77,7 +86,7 @@ def save_ply(
         gaussians.shN.transpose(1, 2).flatten(1),
         gaussians.opacities[:, None],
         gaussians.scales,
-        gaussians.quats,
+        gaussians.quats if exact else unit,
     ]
     table = torch.cat([column.detach().float() for column in columns], dim=1)
     header = [

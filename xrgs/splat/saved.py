@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from numpy.typing import NDArray
+    from torch import Tensor
 
 CERTAIN_LOGIT = 100.0
 """Stands for an infinite logit: float32 rounds the opacity to 1, and to less than 1e-43."""
@@ -48,6 +50,26 @@ def check_finite(path: Path, table: NDArray[Any], names: Sequence[str]) -> None:
             f"{path}: {names[column]} of Gaussian {row} (from 0) is {table[row, column]}; "
             "it must be finite"
         )
+
+
+def check_arrays_finite(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Raise XrgsError for a value of arrays [N, ...] by their names that is not finite."""
+    for name, values in arrays.items():
+        width = math.prod(values.shape[1:])
+        check_finite(path, values.reshape(len(values), width), [name] * width)
+
+
+def unit_quaternions(quats: Tensor) -> NDArray[np.float64]:
+    """Return quaternions [N, 4] wxyz of length 1, which other programs expect in files.
+
+    float64 holds the squares of all float32. A quaternion of zeros becomes the identity, as it is
+    rendered; one with a value that is not finite becomes NaN.
+    """
+    values = quats.detach().double().numpy()
+    with np.errstate(invalid="ignore"):
+        length = np.linalg.norm(values, axis=1, keepdims=True)
+        unit = values / np.where(length == 0, 1.0, length)
+    return np.where(length == 0, [1.0, 0, 0, 0], unit)
 
 
 def to_gaussians(values: Mapping[str, NDArray[Any]]) -> Gaussians:

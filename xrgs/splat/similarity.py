@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from xrgs.splat.gaussians import Gaussians
+from xrgs.splat.saved import unit_quaternions
 from xrgs.splat.sh import bases, sh_basis
 
 if TYPE_CHECKING:
@@ -24,31 +25,33 @@ def transformed(gaussians: Gaussians, similarity: NDArray[np.float64]) -> Gaussi
 
     Args:
         gaussians: N Gaussians.
-        similarity: [4, 4] from the old world to the new one: a rotation times a scale above 0, and
-            a translation.
+        similarity: [4, 4] from the old world to the new one: a rotation, which may mirror, times a
+            scale above 0, and a translation.
 
     Returns:
-        float32 leaf tensors with gradients on; computed in float64.
+        float32 leaf tensors with gradients on, with unit quaternions; computed in float64.
 
     Raises:
         ValueError: The matrix is no such similarity.
     """
     linear = similarity[:3, :3]
-    scale = np.cbrt(np.linalg.det(linear)) if np.isfinite(similarity).all() else 0.0
-    if scale <= 0:
-        raise ValueError("must be finite, a rotation times a scale above 0, without mirroring")
+    determinant = float(np.linalg.det(linear)) if np.isfinite(similarity).all() else 0.0
+    if determinant == 0:
+        raise ValueError("must be finite, a rotation times a scale above 0")
+    scale = np.cbrt(abs(determinant))
     rotation = linear / scale
     if not np.allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=_TOLERANCE):
         raise ValueError("must be a rotation times one scale for all axes, without shear")
-    turn = torch.from_numpy(rotation)
+    # A mirror turns an ellipsoid as its negative does, which is a rotation.
+    proper = Rotation.from_matrix(rotation * np.sign(determinant))
     values = {
         "means": gaussians.means.detach().double() @ torch.from_numpy(linear.T.copy())
         + torch.from_numpy(similarity[:3, 3].copy()),
-        "quats": _product(Rotation.from_matrix(rotation), gaussians.quats.detach().double()),
+        "quats": _product(proper, torch.from_numpy(unit_quaternions(gaussians.quats))),
         "scales": gaussians.scales.detach().double() + float(np.log(scale)),
         "opacities": gaussians.opacities.detach(),
         "sh0": gaussians.sh0.detach(),
-        "shN": _turned_harmonics(gaussians.shN.detach().double(), turn),
+        "shN": _turned_harmonics(gaussians.shN.detach().double(), torch.from_numpy(rotation)),
     }
     return Gaussians(**{name: of.float().clone().requires_grad_() for name, of in values.items()})
 
@@ -63,8 +66,8 @@ def _product(turn: Rotation, quats: Tensor) -> Tensor:
 def _turned_harmonics(coefficients: Tensor, turn: Tensor) -> Tensor:
     """Return coefficients [N, K - 1, 3] whose function f' has f'(turn d) = f(d) for all d.
 
-    A turn mixes the harmonics of a band among each other alone. How is found from their values at
-    more directions than there are harmonics, which determine it exactly.
+    A turn or a mirror mixes only the harmonics of a band among each other. How is found from their
+    values at more directions than there are harmonics, which determine it exactly.
     """
     degree = round((coefficients.shape[1] + 1) ** 0.5) - 1
     dirs = torch.randn((64, 3), generator=torch.Generator().manual_seed(0), dtype=torch.float64)

@@ -1,11 +1,14 @@
 """Gaussians in .spz files, Niantic's compressed format.
 
 Versions 2 and 3 are one gzip stream. Version 4 has the same content in streams of zstd. Own files
-are of version 3, which every program reads.
+are of version 3, which needs no zstd; docs/export.md says which programs read it.
 
 Positions are 24-bit fixed-point numbers, unit quaternions take 32 bits, and all else takes 8 bits
-each. The axes are right, up, backward, where .ply files have right, down, forward: Gaussians are
-turned about x when they are written, and back when they are read.
+each.
+
+The axes are those of the .ply that a file was made of: Niantic's converter and its successors write
+coordinates as they are, whatever the format's description says of its axes. A file that names its
+axes (Adobe's extension 0xADBE0003) is turned to right, down, forward, the axes of .ply files.
 """
 
 from __future__ import annotations
@@ -21,7 +24,14 @@ import torch
 
 from xrgs.errors import XrgsError
 from xrgs.safeio.atomic import atomic_writer
-from xrgs.splat.saved import CERTAIN_LOGIT, SavedGaussians, to_gaussians
+from xrgs.splat.gaussians import PARAMETERS
+from xrgs.splat.saved import (
+    CERTAIN_LOGIT,
+    SavedGaussians,
+    check_arrays_finite,
+    to_gaussians,
+    unit_quaternions,
+)
 from xrgs.splat.sh import MAX_DEGREE, bases
 from xrgs.splat.similarity import transformed
 
@@ -44,17 +54,22 @@ _TABLE_PLACE = struct.Struct("<I12x")  # follows the header in version 4
 _TABLE_ENTRY = struct.Struct("<QQ")  # bytes of a stream, and of its content
 _ANTIALIASED, _EXTENDED = 1, 2  # flags
 _MAX_FRACTION = 23  # bits; one of the 24 is the sign
+_LOG_SCALES = (-10.0, 255 / 16 - 10)  # the least and the largest
 _COLOR_SCALE = 0.15  # band 0 of +-3.3 fits in 8 bits
 _LARGEST_PART = 2**-0.5  # of the three smaller components of a unit quaternion
 _MAX_UNPACKED = 200  # times the size of the file; gzip packs zeros 1000 times smaller
-_RIGHT_UP_BACKWARD = np.diag([1.0, -1.0, -1.0, 1.0])
+_EXTENSION = struct.Struct("<II")  # its type, and the bytes of its content
+_MAX_EXTENSIONS = 1 << 20  # bytes
+_AXES_EXTENSION = 0xADBE0003
+_MOST_AXES = 16
 
 
 def write_spz(path: Path, gaussians: Gaussians, *, antialiased: bool = False) -> None:
     """Write Gaussians to a .spz file of version 3, which is replaced atomically.
 
     What the format can't hold is set to the nearest value that it can: scales outside e^-10 to
-    e^5.9, coefficients of bands above 0 outside -1..1, coordinates beyond 8 million.
+    e^5.9, coefficients of bands above 0 outside -1..1, coordinates beyond 8 million. Nothing is
+    turned: the file has the axes of the Gaussians' world.
 
     Args:
         path: The file to write.
@@ -62,14 +77,19 @@ def write_spz(path: Path, gaussians: Gaussians, *, antialiased: bool = False) ->
         antialiased: Whether they are to be rendered with `RasterSettings.antialiased`.
 
     Raises:
+        XrgsError: A parameter is NaN, or a position, quaternion or coefficient is infinite; the
+            message names it.
         OSError: The file can't be written.
     """
-    turned = transformed(gaussians, _RIGHT_UP_BACKWARD)
-    means, quats, scales, sh0, shN = (
+    means, scales, sh0, shN = (
         value.detach().double().numpy()
-        for value in (turned.means, turned.quats, turned.scales, turned.sh0, turned.shN)
+        for value in (gaussians.means, gaussians.scales, gaussians.sh0, gaussians.shN)
     )
-    alpha = turned.opacities.detach().double().sigmoid().numpy()
+    quats = unit_quaternions(gaussians.quats)
+    alpha = gaussians.opacities.detach().double().sigmoid().numpy()
+    scales = scales.clip(*_LOG_SCALES)
+    values = (means, quats, scales, alpha, sh0, shN)
+    check_arrays_finite(path, dict(zip(PARAMETERS, values, strict=True)))
     degree = round((shN.shape[1] + 1) ** 0.5) - 1
     bits = _fraction_bits(float(np.abs(means).max(initial=0)))
     flags = _ANTIALIASED if antialiased else 0
@@ -99,13 +119,11 @@ def _to_bytes(values: NDArray[np.float64]) -> Bytes:
 
 
 def _packed_quaternions(quats: NDArray[np.float64]) -> NDArray[Any]:
-    """Pack quaternions [N, 4] wxyz: the index of the largest component, and the other three.
+    """Pack unit quaternions [N, 4] wxyz: the index of the largest component, and the other three.
 
     Each of the three takes 10 bits, of which the highest is the sign. The largest one is positive.
     """
-    length = np.linalg.norm(quats, axis=1, keepdims=True)
-    xyzw = np.where(length > 0, quats, [1.0, 0, 0, 0])[:, [1, 2, 3, 0]]
-    xyzw = xyzw / np.where(length > 0, length, 1.0)
+    xyzw = quats[:, [1, 2, 3, 0]]
     rows = np.arange(len(xyzw))
     largest = np.abs(xyzw).argmax(axis=1)
     xyzw *= np.where(xyzw[rows, largest] < 0, -1.0, 1.0)[:, None]
@@ -149,18 +167,55 @@ def _read(path: Path, content: bytes) -> SavedGaussians:
         raise ValueError(f"{count} Gaussians do not fit in {len(content)} bytes")
     if not is_packed:
         body = b"".join(_streams(path, content, streams, size))
+        (table,) = _TABLE_PLACE.unpack_from(content, _HEADER.size)
+        extensions = content[_HEADER.size + _TABLE_PLACE.size : table]
     else:
         body = stream.decompress(stream.unconsumed_tail, size) if size else b""
+        extensions = stream.decompress(stream.unconsumed_tail, _MAX_EXTENSIONS)
     if len(body) != size:
         raise ValueError(f"has {len(body)} of its {size} bytes")
-    if flags & _EXTENDED:
-        _log.warning("%s: has extensions, which are not read", path)
+    axes = _named_axes(path, extensions) if flags & _EXTENDED else 0
     if degree > MAX_DEGREE:
         _log.warning("%s: bands of the harmonics above %d are left out", path, MAX_DEGREE)
     ends = np.cumsum([count * width for width in widths])[:-1]
     parts = np.split(np.frombuffer(body, np.uint8), ends)
     rows = [part.reshape(count, width) for part, width in zip(parts, widths, strict=True)]
-    return _unpacked(rows, version, fraction, bool(flags & _ANTIALIASED))
+    read = to_gaussians(_unpacked(rows, version, fraction))
+    if axes:
+        read = transformed(read, _to_ply(axes))
+    return SavedGaussians(read, bool(flags & _ANTIALIASED))
+
+
+def _named_axes(path: Path, extensions: bytes) -> int:
+    """Return the number of the axes that extensions name; 0 where they name none."""
+    axes, at = 0, 0
+    while at + _EXTENSION.size <= len(extensions):
+        kind, length = _EXTENSION.unpack_from(extensions, at)
+        at += _EXTENSION.size + length
+        if at > len(extensions):
+            raise ValueError("ends within an extension")
+        if kind != _AXES_EXTENSION:
+            _log.warning("%s: has the extension %#010x, which is not read", path, kind)
+            continue
+        axes = int.from_bytes(extensions[at - length : at], "little")
+        if length != 4 or axes > _MOST_AXES:
+            raise ValueError(f"its extension {kind:#x} names axes {axes}, not 0 to {_MOST_AXES}")
+    return axes
+
+
+def _to_ply(axes: int) -> NDArray[np.float64]:
+    """Return the matrix [4, 4] from a world of named axes to one of right, down, forward.
+
+    As Niantic's library turns: bits of the number less 1 are whether x points right, y up and z
+    forward, and whether a quarter turn about x is between. From 9 on, the library's names of the
+    axes fit its turns in four of eight cases only; its files are as it turns.
+    """
+    bits = axes - 1
+    signs = [1 if bits & 1 else -1, -1 if bits & 2 else 1, 1 if bits & 4 else -1, 1]
+    matrix = np.diag(np.array(signs, np.float64))
+    if bits & 8:
+        matrix = matrix[[0, 2, 1, 3]] * [[1], [1], [-1], [1]]
+    return matrix
 
 
 def _streams(path: Path, content: bytes, count: int, size: int) -> Iterator[bytes]:
@@ -189,7 +244,8 @@ def _streams(path: Path, content: bytes, count: int, size: int) -> Iterator[byte
         start += packed
 
 
-def _unpacked(parts: list[Bytes], version: int, fraction: int, antialiased: bool) -> SavedGaussians:
+def _unpacked(parts: list[Bytes], version: int, fraction: int) -> dict[str, NDArray[Any]]:
+    """Return the parameters by their names."""
     positions, alphas, colors, scales, quats, harmonics = parts
     count = len(alphas)
     wide = np.zeros((count, 3, 4), np.uint8)
@@ -199,17 +255,14 @@ def _unpacked(parts: list[Bytes], version: int, fraction: int, antialiased: bool
     sh = (
         harmonics.reshape(count, harmonics.shape[1] // 3, 3)[:, : bases(MAX_DEGREE) - 1] - 128.0
     ) / 128.0
-    read = to_gaussians(
-        {
-            "means": fixed / 2.0**fraction,
-            "opacities": alpha.logit().clamp(-CERTAIN_LOGIT, CERTAIN_LOGIT).numpy(),
-            "sh0": ((colors / 255.0 - 0.5) / _COLOR_SCALE)[:, None],
-            "scales": scales / 16.0 - 10,
-            "quats": _small_quaternions(quats) if version == 2 else _quaternions(quats),
-            "shN": sh,
-        }
-    )
-    return SavedGaussians(transformed(read, _RIGHT_UP_BACKWARD), antialiased)
+    return {
+        "means": fixed / 2.0**fraction,
+        "opacities": alpha.logit().clamp(-CERTAIN_LOGIT, CERTAIN_LOGIT).numpy(),
+        "sh0": ((colors / 255.0 - 0.5) / _COLOR_SCALE)[:, None],
+        "scales": scales / 16.0 - 10,
+        "quats": _small_quaternions(quats) if version == 2 else _quaternions(quats),
+        "shN": sh,
+    }
 
 
 def _quaternions(packed: Bytes) -> NDArray[np.float64]:

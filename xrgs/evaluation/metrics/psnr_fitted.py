@@ -18,8 +18,10 @@ def psnr_fitted(image: Tensor, target: Tensor, mask: Tensor | None = None) -> fl
     float64. Its result is clamped to 0..1. A photograph of another exposure or white balance than
     the scene's is scored by what it shows. Training sees nothing of the map.
 
-    Such "colour-corrected" scores are customary where training learns exposures: gsplat [ye2025]
-    reports `cc_psnr`, with the same map or a quadratic one.
+    Such "colour-corrected" scores are customary where training learns exposures, with other maps:
+    `cc_psnr` of gsplat 1.6.0 [ye2025] fits a line from photograph to render in each channel by
+    itself and inverts it, or fits the photograph by a quadratic function of the render's three
+    channels, which is the only map of 1.5.3. So its numbers are not these.
 
     Args:
         image: The render, [H, W, 3] in 0..1.
