@@ -20,7 +20,7 @@ from xrgs.config import CONF_DIR, TRAINING_VIEWS, Conf, known_keys, types_of
 from xrgs.errors import XrgsError, did_you_mean
 from xrgs.safeio.records import read_struct
 from xrgs.splat.backend import CHOICES
-from xrgs.splat.settings import NOMINAL_STEPS, SPLITS, STRATEGIES
+from xrgs.splat.settings import NOMINAL_STEPS, SPLITS, STARTS, STRATEGIES
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -130,6 +130,7 @@ def _check_choices(conf: Conf) -> None:
         ("train.views", conf.train.views, TRAINING_VIEWS),
         ("splat.backend", conf.splat.backend, CHOICES),
         ("splat.strategy", conf.splat.strategy, STRATEGIES),
+        ("splat.init", conf.splat.init, STARTS),
         ("splat.densify.split", conf.splat.densify.split, SPLITS),
         ("retry", conf.retry, _RETRY),
     ):
