@@ -32,11 +32,12 @@ _PLANES = 16, 128
 """The least and the most planes of a sweep."""
 _REACH = 3, 8
 """The least and the most planes to either side of a pixel's depth that a refinement looks at."""
-_REFINEMENTS = 2
+_REFINEMENTS = 3
 """A refinement bends the planes to the depths that it begins with. So each is more exact than the
 one before; our choice."""
-_MEDIAN = 5
-"""The side of the window, px, whose median takes single wrong depths out after each refinement."""
+_WINDOW = 5
+"""The side of the window, px, whose median takes single wrong depths out after each refinement, and
+whose mean evens out the others, across no edge."""
 _LEAST_FINE = 3
 """A fine level is compared with fine ones only where this many neighbours have one."""
 
@@ -169,8 +170,27 @@ def _refined(
         around = np.maximum(depths + offsets[:, None, None], far / 2)
         place = minimum(smoothed(costs(level, others, around)))
         depths = np.maximum(depths + offsets[0] + (offsets[1] - offsets[0]) * place, far / 2)
-        depths = median_filter(depths, _MEDIAN, mode="nearest")
+        depths = evened(median_filter(depths, _WINDOW, mode="nearest"), planes.step)
     return depths
+
+
+def evened(image: Floats, range_: np.float32) -> Floats:
+    """The mean [h, w] of each pixel's window, over the values near its own.
+
+    Args:
+        image: [h, w]
+        range_: Values count that differ from the pixel's own by at most this.
+    """
+    height, width = image.shape
+    total, number = np.zeros_like(image), np.zeros_like(image)
+    padded = np.pad(image, _WINDOW // 2, mode="edge")
+    for row in range(_WINDOW):
+        for column in range(_WINDOW):
+            other = padded[row : row + height, column : column + width]
+            near = np.abs(other - image) <= range_
+            total += np.where(near, other, 0)
+            number += near
+    return total / number
 
 
 def enlarged(image: Floats, height: int, width: int) -> Floats:

@@ -74,7 +74,7 @@ def cover(maps: Sequence[DepthMap], budget: int) -> Squares:
         Quadtree(
             each.view.photograph.image.numpy(),
             _on_photograph(each, pixels),
-            # Errors count by the angle that a pixel takes, so that coarse views are not left coarser.
+            # Errors count by the angle that a pixel takes, so that coarse views are split too.
             weight=(max(focal) / own) ** 2,
         )
         for (each, pixels), own in zip(having, focal, strict=True)
