@@ -45,7 +45,8 @@ def good_points(depths: DepthMap) -> Doubles:
     """The points [P, 3] of the good pixels of a view, world units, row by row."""
     row, column = np.nonzero(depths.good)
     depth = 1 / depths.inverse_depth[row, column].astype(np.float64)
-    return depths.level.to_world(column + 0.5, row + 0.5, depth)
+    x, y = (axis.astype(np.float64) + 0.5 for axis in (column, row))
+    return depths.level.to_world(x, y, depth)
 
 
 def consistent(maps: Mapping[int, DepthMap], number: int) -> Bools:

@@ -114,7 +114,8 @@ def _depths_in_image(level: Level, points: Doubles) -> Doubles:
     x, y, depth = level.project(points)
     height, width = level.gray.shape
     inside = (x >= 0) & (x <= width) & (y >= 0) & (y <= height)  # false for nan
-    return depth[inside]
+    depths: Doubles = depth[inside]
+    return depths
 
 
 def _displacement(level: Level, others: Sequence[Level], far: float, near: float) -> float:

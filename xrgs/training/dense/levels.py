@@ -164,4 +164,5 @@ def _used(view: TrainingView, height: int, width: int) -> Bools:
         ((np.arange(new) + 0.5) * old / new).astype(np.int64)
         for old, new in zip(mask.shape, (height, width), strict=True)
     )
-    return mask[rows[:, None], columns]
+    used: Bools = mask[rows[:, None], columns]
+    return used

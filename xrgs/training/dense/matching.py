@@ -32,7 +32,7 @@ class Windows:
         """
         # Differences from mid-gray, since less of the variances is then lost to rounding.
         self.image = image - np.float32(0.5)
-        self.share = 1 / box_sum(np.ones_like(image))
+        self.share: Floats = np.float32(1) / box_sum(np.ones_like(image))
         """1 over the number of pixels [h, w] of each window that are in the image."""
         self.mean, self.variance = self._moments(self.image)
 

@@ -58,9 +58,9 @@ class Quadtree:
 
     def _errors(self, squares: Indices) -> Doubles:
         number = np.maximum(np.bincount(squares), 1)
-        total = np.bincount(squares, np.square(self.colors).sum(axis=1))
+        total: Doubles = np.bincount(squares, np.square(self.colors).sum(axis=1))
         for channel in self.colors.T:
-            total -= np.square(np.bincount(squares, channel)) / number
+            total = total - np.square(np.bincount(squares, channel)) / number
         return np.maximum(total, 0)
 
     def roots(self) -> int:

@@ -52,7 +52,7 @@ def _both_ways(costs: Floats) -> Floats:
 def _next(path: Floats, costs: Floats) -> Floats:
     """L of the next pixels of m lines, of L [D, m] and the pixels' costs [D, m]."""
     least = path.min(axis=0)
-    reached = np.minimum(path, least + np.float32(JUMP))
+    reached: Floats = np.minimum(path, least + np.float32(JUMP))
     np.minimum(reached[1:], path[:-1] + np.float32(STEP), out=reached[1:])
     np.minimum(reached[:-1], path[1:] + np.float32(STEP), out=reached[:-1])
     reached -= least

@@ -91,7 +91,8 @@ def _on_photograph(depths: DepthMap, pixels: Bools) -> Bools:
         ((np.arange(new) + 0.5) * old / new).astype(np.int64)
         for new, old in zip((camera.height, camera.width), pixels.shape, strict=True)
     )
-    return pixels[rows[:, None], columns]
+    enlarged: Bools = pixels[rows[:, None], columns]
+    return enlarged
 
 
 def _squares(depths: DepthMap, tree: Quadtree, limit: float) -> tuple[Doubles, Doubles, Doubles]:
@@ -112,7 +113,8 @@ def _squares(depths: DepthMap, tree: Quadtree, limit: float) -> tuple[Doubles, D
 
 def share_good(views: Sequence[SweptView], maps: Sequence[DepthMap]) -> float:
     """The share of the views' pixels inside masks whose depths hold, in the mean of the views."""
-    return sum(each.good.sum() / max(each.level.used.sum(), 1) for each in maps) / len(views)
+    shares = (each.good.sum() / max(each.level.used.sum(), 1) for each in maps)
+    return float(sum(shares)) / len(views)
 
 
 def share_covered(views: Sequence[SweptView], points: Doubles) -> float:
