@@ -79,10 +79,11 @@ def test_squares_lie_on_the_surfaces_in_their_colours(
     inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
     place = y[inside].astype(int), x[inside].astype(int)
     exact = scene.depths(0, first.finest)[place]
-    # Others are on surfaces that the view doesn't see, behind what it does.
-    near = np.abs(depth[inside] / exact - 1) < 0.03
-    assert (depth[inside] / exact < 0.97).mean() < 0.15
-    assert near.mean() > 0.6
+    # Others are on surfaces that the view doesn't see, behind what it does. In front are those at
+    # the rims of near things, which windows of 5 px at 60 and 120 px make wider than they are.
+    near = np.abs(depth[inside] / exact - 1) < 0.05
+    assert (depth[inside] / exact < 0.9).mean() < 0.15
+    assert near.mean() > 0.7
     gray = squares.colors[inside].mean(axis=1) - first.finest.gray[place]
     assert np.median(np.abs(gray[near])) < 0.05
     # A square is as large as its pixels at its depth: all of them cover about the image.

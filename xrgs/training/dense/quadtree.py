@@ -58,7 +58,7 @@ class Quadtree:
 
     def _errors(self, squares: Indices) -> Doubles:
         number = np.maximum(np.bincount(squares), 1)
-        total: Doubles = np.bincount(squares, np.square(self.colors).sum(axis=1))
+        total = np.bincount(squares, np.square(self.colors).sum(axis=1)).astype(np.float64)
         for channel in self.colors.T:
             total = total - np.square(np.bincount(squares, channel)) / number
         return np.maximum(total, 0)
