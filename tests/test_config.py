@@ -154,6 +154,7 @@ def test_the_splat_librarys_defaults_are_the_baselines(group: str, compose: Comp
         "splat.densify.budget=inf",
         "splat.densify.noise=-1",
         "splat.strategy=mc",
+        "splat.init=random",
         "splat.init_scale=0",
         "splat.init_scale=nan",
     ],

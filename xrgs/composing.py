@@ -23,7 +23,7 @@ from xrgs.errors import XrgsError, did_you_mean
 from xrgs.safeio.paths import user_path
 from xrgs.safeio.records import read_struct
 from xrgs.splat.backend import CHOICES
-from xrgs.splat.settings import NOMINAL_STEPS, SPLITS, STRATEGIES
+from xrgs.splat.settings import NOMINAL_STEPS, SPLITS, STARTS, STRATEGIES
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -195,6 +195,7 @@ def _check_choices(conf: Conf) -> None:
         ("train.views", conf.train.views, TRAINING_VIEWS),
         ("splat.backend", conf.splat.backend, CHOICES),
         ("splat.strategy", conf.splat.strategy, STRATEGIES),
+        ("splat.init", conf.splat.init, STARTS),
         ("splat.densify.split", conf.splat.densify.split, SPLITS),
         ("retry", conf.retry, _RETRY),
     ):

@@ -105,6 +105,7 @@ class SplatConf:
     optimizer: OptimizerSettings
     densify: DensifySettings
     strategy: str = off("default")
+    init: str = off("sfm")
     sh_every: int
     init_opacity: float
     init_scale: float = off(1.0)

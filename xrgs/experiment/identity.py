@@ -80,6 +80,9 @@ CORE = (
 #: Files that count on one backend only. Of the native one these are the C++ sources, and not the
 #: compiled module: two builds of the same sources differ in their bytes and give the same numbers.
 BACKEND_CODE = {"native": ("csrc",), "gsplat": ("splat/gsplat",)}
+#: The code that places the first Gaussians, by the values of `splat.init` that have code of their
+#: own.
+STARTS = {"dense": ("training/dense",)}
 
 
 def cell_identity(conf: Conf, variant_id: str) -> Identity:
@@ -103,7 +106,9 @@ def cell_identity(conf: Conf, variant_id: str) -> Identity:
         splat=identity_values(conf.splat) | {"backend": backend},
         components=components,
         arithmetic=arithmetic(backend),
-        code=training_code(backend, tuple(components), tuple(sorted(conf.components.plugins))),
+        code=training_code(
+            backend, tuple(components), tuple(sorted(conf.components.plugins)), conf.splat.init
+        ),
     )
 
 
@@ -114,7 +119,10 @@ def cell_id(identity: Identity) -> str:
 
 @cache
 def training_code(
-    backend: str, components: tuple[str, ...] = (), plugin_names: tuple[str, ...] = ()
+    backend: str,
+    components: tuple[str, ...] = (),
+    plugin_names: tuple[str, ...] = (),
+    init: str = "sfm",
 ) -> dict[str, str]:
     """Return the digest of each part of the code that trains a cell; files are read once.
 
@@ -122,29 +130,35 @@ def training_code(
         backend: `native`, `torch` or `gsplat`.
         components: Keys of the components that are on.
         plugin_names: Names of components of other packages, sorted.
+        init: `splat.init` of the config.
 
     Raises:
         XrgsError: A plugin is not installed, or has no source file.
     """
-    return code_now(backend, components, plugin_names)
+    return code_now(backend, components, plugin_names, init)
 
 
 def code_now(
-    backend: str, components: tuple[str, ...] = (), plugin_names: tuple[str, ...] = ()
+    backend: str,
+    components: tuple[str, ...] = (),
+    plugin_names: tuple[str, ...] = (),
+    init: str = "sfm",
 ) -> dict[str, str]:
     """Return `training_code` of the files as they are now, edited meanwhile or not."""
-    files = _files(backend, components)
+    files = _files(backend, components, init)
     code = {part: canonical(part, code_digest(*names)) for part, names in files.items()}
     if order := order_of(components):  # of the components' hooks
         code["order"] = order
     return code | {f"plugins/{name}": plugins.code_digest(name) for name in plugin_names}
 
 
-def _files(backend: str, components: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
+def _files(backend: str, components: tuple[str, ...], init: str) -> dict[str, tuple[str, ...]]:
     """Return the source files of each part of the code, relative to the package."""
     files: dict[str, tuple[str, ...]] = {"core": CORE}
     if backend in BACKEND_CODE:
         files[backend] = BACKEND_CODE[backend]
+    if init in STARTS:
+        files[init] = STARTS[init]
     return files | {key: modules_of(key) for key in components if modules_of(key)}
 
 
@@ -169,4 +183,5 @@ def current_code(identity: Identity, *, cached: bool = False) -> dict[str, str]:
     """Return the digests that the parts of an identity's code have in the installed package."""
     names = tuple(sorted(identity.components.get("plugins", {})))
     code = training_code if cached else code_now
-    return code(str(identity.splat["backend"]), tuple(identity.components), names)
+    init = str(identity.splat.get("init", "sfm"))
+    return code(str(identity.splat["backend"]), tuple(identity.components), names, init)

@@ -23,6 +23,9 @@ KEPT_BYTES = 264 * 2**20
 STRATEGIES = ("default", "mcmc")
 """The strategies of densification, by the names of gsplat's (`xrgs.training.loop`)."""
 
+STARTS = ("sfm", "dense")
+"""What training starts from: the SfM points, or also surfaces (`xrgs.training.dense`)."""
+
 SPLITS = ("random", "long_axis")
 """The values of `DensifySettings.split`."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -264,21 +265,35 @@ def _prune_by_components(run: _Run, step: Step, refinement: Refinement) -> Refin
     return replace(refinement, pruned_by_components=removed)
 
 
-def _set_up(data: Dataset, conf: Conf, extra_components: Iterable[Component]) -> _Run:
-    """Build everything that the steps use."""
-    splat, steps = conf.splat, conf.train.steps
-    backend = resolve_backend(splat.backend)
-    place = device(backend)
-    # The points stay on the CPU: what is computed of them is computed once.
-    data = replace(data, train=tuple(view.to(place) for view in data.train))
-    gaussians = from_points(
+def _first_gaussians(data: Dataset, conf: Conf, backend: str) -> tuple[Gaussians, float]:
+    """Return the Gaussians that training starts from, and the seconds that a dense start took."""
+    splat = conf.splat
+    sparse = from_points(
         data.points,
         data.colors,
         init_opacity=splat.init_opacity,
         init_scale=splat.init_scale,
         sh_degree=splat.raster.sh_degree,
         generator=seeded_generator(conf.seed, "init"),
-    ).to(place)
+    )
+    if splat.init == "sfm":
+        return sparse, 0.0
+    from xrgs.training.dense import dense_start  # counts in a cell's identity where it is on
+
+    began = time.perf_counter()
+    gaussians = dense_start(data, sparse, backend, seeded_generator(conf.seed, "dense"))
+    return gaussians, time.perf_counter() - began
+
+
+def _set_up(data: Dataset, conf: Conf, extra_components: Iterable[Component]) -> _Run:
+    """Build everything that the steps use."""
+    splat, steps = conf.splat, conf.train.steps
+    backend = resolve_backend(splat.backend)
+    gaussians, start_seconds = _first_gaussians(data, conf, backend)
+    place = device(backend)
+    gaussians = gaussians.to(place)
+    # The points stay on the CPU: what is computed of them is computed once.
+    data = replace(data, train=tuple(view.to(place) for view in data.train))
     optimizer = SplatOptimizer(
         gaussians, splat.optimizer, scene_scale=data.scene_scale, steps=steps, backend=backend
     )
@@ -296,6 +311,8 @@ def _set_up(data: Dataset, conf: Conf, extra_components: Iterable[Component]) ->
     views = _Views(data.train, backend)
     # After all preparation, since its clock starts here.
     recorder = TrainingRecorder(steps, splat.densify.grow_grad2d, data.train)
+    if start_seconds:
+        recorder.add_start(start_seconds)
     sh_every = max(1, int(splat.sh_every * steps / NOMINAL_STEPS))
     return _Run(
         splat=splat,

@@ -41,7 +41,8 @@ class TrainingResult:
     steps since the row before that logged it, or None where none did. Every row has every
     column."""
     seconds: float
-    """Time of the training steps alone: no loading of data, no evaluation, no checkpoints."""
+    """Time of the training steps and of a dense start: no loading of data, no evaluation, no
+    checkpoints."""
     memory_bytes: int
     """Bytes that training held at the step where they were most (`TrainingMemory`)."""
     evaluations: int
@@ -50,7 +51,7 @@ class TrainingResult:
     """Further counts of work: `StepWork.totals`."""
     stage_seconds: dict[str, float]
     """`seconds` by the stages of a step: `forward` (render and loss), `backward`, `optimizer`, and
-    `densification` with all that follows."""
+    `densification` with all that follows; `start` before them where training has a dense start."""
     grow_grad2d: float
     """`splat.densify.grow_grad2d` of this training, in normalised device units."""
     scores: list[dict[str, Any]] = field(default_factory=list)
@@ -94,6 +95,11 @@ class TrainingRecorder:
         now = time.perf_counter()
         self.stage_seconds[stage] += now - self.lap_started
         self.lap_started = now
+
+    def add_start(self, seconds: float) -> None:
+        """Count what has passed before the clock was started as training time, as stage `start`."""
+        self.started -= seconds
+        self.stage_seconds["start"] += seconds
 
     def record_skipped(self, part: str) -> None:
         """Count a part of a step that is left out; call it before `record_step`.

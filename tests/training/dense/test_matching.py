@@ -1,0 +1,70 @@
+"""Correlations against numpy's in float64, and the costs of exact depths and of others."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tests.training.dense.conftest import TrueScene
+from xrgs.training.dense.levels import swept_views
+from xrgs.training.dense.matching import BEST, REACH, Windows, box_sum, costs
+
+
+def test_correlation_is_that_of_each_window() -> None:
+    """Against `numpy.corrcoef` in float64, and the noise in the denominator."""
+    rng = np.random.default_rng(0)
+    first, second = rng.random((2, 9, 12)).astype(np.float32)
+    second = 0.6 * first + 0.4 * second
+    computed = Windows(first).zncc(np.stack([second, 1 - second]))
+    for row in range(9):
+        for column in range(12):
+            window = (
+                slice(max(row - REACH, 0), row + REACH + 1),
+                slice(max(column - REACH, 0), column + REACH + 1),
+            )
+            pair = (first[window].ravel().astype(float), second[window].ravel().astype(float))
+            expected = np.corrcoef(*pair)[0, 1]
+            shrink = np.prod([np.sqrt(v / (v + 1e-5)) for v in map(np.var, pair)])
+            np.testing.assert_allclose(computed[0, row, column], expected * shrink, atol=2e-6)
+            np.testing.assert_allclose(computed[1, row, column], -expected * shrink, atol=2e-6)
+
+
+def test_correlation_ignores_gain_and_offset_and_flat_windows_have_none() -> None:
+    image = np.random.default_rng(1).random((8, 8)).astype(np.float32)
+    np.testing.assert_allclose(Windows(image).zncc(0.5 * image + 0.2), 1, atol=2e-3)
+    assert not np.any(Windows(image).zncc(np.full_like(image, 0.3)) > 1e-3)
+
+
+def test_box_sums_are_those_of_the_pixels_in_the_image() -> None:
+    image = np.arange(30, dtype=np.float32).reshape(1, 5, 6)
+    sums = box_sum(image)
+    assert sums[0, 2, 2] == image[0, 0:5, 0:5].sum()
+    assert sums[0, 0, 0] == image[0, :3, :3].sum()
+    assert sums[0, 4, 5] == image[0, 2:, 3:].sum()
+
+
+def test_true_depths_cost_least(scene: TrueScene) -> None:
+    """At most pixels, the exact depth costs less than depths 5 % nearer and farther."""
+    views = swept_views(scene.data.train[:6], "torch")
+    exact = scene.depths(0, views[0].coarse)
+    depths = np.stack([0.95 * exact, exact, 1.05 * exact])
+    volume = costs(views[0].coarse, [v.coarse for v in views[1:]], (1 / depths).astype(np.float32))
+    assert volume.shape == (3, *exact.shape)
+    assert volume.min() >= 0
+    assert volume.max() <= 1
+    assert (volume.argmin(axis=0) == 1).mean() > 0.7
+
+
+def test_what_no_other_view_sees_has_no_score(scene: TrueScene) -> None:
+    views = swept_views(scene.data.train[:2], "torch")
+    behind = np.full((1, 1, 1), -1e3, np.float32)  # behind both cameras
+    assert (costs(views[0].coarse, [views[1].coarse], behind) == 1).all()
+
+
+def test_fewer_views_than_the_best_are_enough(scene: TrueScene) -> None:
+    """With one other view the score is its correlation: of a view with itself, at any depth."""
+    level = swept_views(scene.data.train[:2], "torch")[0].coarse
+    assert BEST > 1
+    volume = costs(level, [level], np.ones((1, 1, 1), np.float32))  # with itself
+    np.testing.assert_allclose(
+        1 - volume[0], Windows(level.gray).zncc(level.gray).clip(0), atol=1e-3
+    )

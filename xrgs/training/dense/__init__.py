@@ -1,0 +1,108 @@
+"""A dense start: Gaussians on surfaces that a plane sweep of the training views finds.
+
+Training that starts from SfM points spends its first steps on growing Gaussians where there are
+none. A dense start spends seconds on finding the surfaces: as EDGS [kotovenko2025] does by matches
+of a network, but by classical multi-view stereo on the variant's own poses:
+
+1. Every view is swept by planes [collins1996] between the depths of its SfM points, evenly in
+   inverse depth, and compared with its nearest neighbours (`depths`, `matching`).
+2. Semi-global matching [hirschmuller2008] smooths the costs (`semiglobal`).
+3. A depth holds where neighbours have it too, and fewer views see through it (`checks`).
+4. Each place of the scene goes to the view that samples it most finely.
+5. A quadtree of each view's own pixels splits where their colours differ, until there are as many
+   leaves as the budget has; each becomes a Gaussian (`quadtree`, `surface`).
+
+The SfM points are kept beside them. Where few depths hold or the views are hardly covered, a dense
+start would harm. It then is off by itself, and the log says so.
+
+Everything is computed on the CPU in float32 and float64, with the same bits for any number of
+threads. Masks are respected, and views may have any sizes.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from xrgs.splat.gaussians import PARAMETERS, Gaussians
+from xrgs.splat.sh import colors_to_sh0
+from xrgs.training.dense.levels import swept_views
+from xrgs.training.dense.surface import Squares, cover, find_depths, share_covered, share_good
+
+if TYPE_CHECKING:
+    from xrgs.capture.dataset import Dataset
+
+BUDGET = 0.25
+"""The most Gaussians, for each pixel of the largest training view: 48,000 at 504 x 378 px; our
+choice."""
+OPACITY = 0.3
+"""The opacity of each Gaussian; our choice."""
+SCALE = 0.5
+"""The scale of each Gaussian, sides of its square; our choice."""
+LEAST_GOOD = 0.6
+"""The least share of the views' pixels whose depths must hold; our choice."""
+LEAST_COVERED = 0.8
+"""The least share of the views that the Gaussians must cover; our choice."""
+
+_log = logging.getLogger(__name__)
+
+
+def dense_start(
+    data: Dataset, sparse: Gaussians, backend: str, generator: torch.Generator
+) -> Gaussians:
+    """Add Gaussians on the surfaces of a scene to those on its SfM points.
+
+    Args:
+        data: The training views and the SfM points.
+        sparse: The Gaussians on the SfM points.
+        backend: `torch` or `native`: the implementation that resamples photographs.
+        generator: Draws the quaternions.
+
+    Returns:
+        The Gaussians on SfM points, then those on surfaces; `sparse` itself where a dense start
+        would harm.
+    """
+    views = swept_views(data.train, backend)
+    maps = list(find_depths(views, data.points.double().numpy()).values())
+    good = share_good(views, maps)
+    if good < LEAST_GOOD:
+        return _off(sparse, f"{good:.0%} of the depths hold in several views", LEAST_GOOD)
+    squares = cover(maps, max(1, round(BUDGET * data.view_pixels)))
+    covered = share_covered(views, squares.points)
+    if covered < LEAST_COVERED:
+        return _off(sparse, f"{covered:.0%} of the training views are covered", LEAST_COVERED)
+    _log.info(
+        "dense start: %d Gaussians beside %d SfM points; %.0f%% of the depths hold, %.0f%% of the"
+        " training views are covered",
+        *(len(squares.points), len(sparse), 100 * good, 100 * covered),
+    )
+    return _joined(sparse, squares, generator)
+
+
+def _off(sparse: Gaussians, why: str, least: float) -> Gaussians:
+    """Say why the start is from the SfM points alone, and return their Gaussians."""
+    _log.warning(
+        "splat.init=dense: off, since only %s, and at least %.0f%% are needed: training starts from"
+        " the SfM points",
+        *(why, 100 * least),
+    )
+    return sparse
+
+
+def _joined(sparse: Gaussians, squares: Squares, generator: torch.Generator) -> Gaussians:
+    count = len(squares.points)
+    log_scales = torch.from_numpy(np.log(SCALE * squares.sides)).float()  # [N]
+    added = {
+        "means": torch.from_numpy(squares.points).float(),
+        "quats": torch.rand((count, 4), generator=generator),
+        "scales": log_scales[:, None].repeat(1, 3),
+        "opacities": torch.full((count,), math.log(OPACITY / (1 - OPACITY))),
+        "sh0": colors_to_sh0(torch.from_numpy(squares.colors).float()),
+        "shN": torch.zeros((count, *sparse.shN.shape[1:])),
+    }
+    both = {name: torch.cat([sparse[name].detach(), added[name]]) for name in PARAMETERS}
+    return Gaussians(**{name: value.requires_grad_() for name, value in both.items()})

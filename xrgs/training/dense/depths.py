@@ -1,0 +1,206 @@
+"""The depths of every view's pixels: a plane sweep on the coarse level, refined on the finest."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import median_filter
+
+from xrgs.training.dense.levels import Bools, Doubles, Floats, Level, SweptView
+from xrgs.training.dense.matching import costs
+from xrgs.training.dense.semiglobal import minimum, smoothed
+
+NEIGHBOURS = 8
+"""A view is compared with the cameras nearest to it, at most as many as this; our choice."""
+_LEAST_PARALLAX = 0.02
+"""Cameras nearer than this times the median depth see no parallax, and are not compared; our
+choice."""
+_LEAST_COSINE = 0.5
+"""Cameras are compared where their axes are at most 60 degrees apart; our choice."""
+_LEAST_POINTS = 8
+"""A view with fewer SfM points in its image is not swept; our choice."""
+_PERCENTILES = 1, 50, 99
+_MARGIN = 1.25
+"""Planes reach beyond the first and last of these percentiles of the SfM points' depths by this
+factor; our choice."""
+_STEP = 0.35
+"""How far the image of a pixel in a neighbour moves between two planes, px, in the median of the
+neighbours; our choice."""
+_PLANES = 16, 128
+"""The least and the most planes of a sweep."""
+_REACH = 3, 8
+"""The least and the most planes to either side of a pixel's depth that a refinement looks at."""
+_REFINEMENTS = 3
+"""A refinement bends the planes to the depths that it begins with. So each is more exact than the
+one before; our choice."""
+_WINDOW = 5
+"""The side of the window, px, whose median takes single wrong depths out after each refinement, and
+whose mean evens out the others, across no edge."""
+_LEAST_FINE = 3
+"""A fine level is compared with fine ones only where this many neighbours have one."""
+
+
+@dataclass(frozen=True)
+class Planes:
+    """The planes that sweep one view."""
+
+    inverse_depths: Floats
+    """[D] 1 / world units, from far to near, evenly spaced."""
+    neighbours: list[int]
+    """The numbers of the views that it can be compared with, the nearest first."""
+
+    @property
+    def step(self) -> np.float32:
+        """The difference of inverse depth between two planes."""
+        step: np.float32 = self.inverse_depths[1] - self.inverse_depths[0]
+        return step
+
+
+@dataclass(frozen=True)
+class DepthMap:
+    """The depths of a view's pixels."""
+
+    view: SweptView
+    inverse_depth: Floats
+    """[h, w] 1 / world units, at the view's finest level."""
+    good: Bools
+    """[h, w] the pixels whose depths have passed all checks so far."""
+    step: float
+    """The difference of inverse depth between two planes of the sweep."""
+    neighbours: list[int]
+    """The numbers of the views that the sweep compared."""
+
+    @property
+    def level(self) -> Level:
+        """The level of the pixels."""
+        return self.view.finest
+
+
+def choose_planes(views: Sequence[SweptView], points: Doubles) -> dict[int, Planes]:
+    """Choose planes and neighbours.
+
+    Args:
+        views: The views.
+        points: SfM points [P, 3], world units.
+
+    Returns:
+        The planes by the numbers of the views, without the views that can't be swept: few points
+        are in their image, or no other camera sees the same from another place.
+    """
+    levels = [view.coarse for view in views]
+    positions = np.stack([level.position for level in levels])
+    axes = np.stack([level.rotation[2] for level in levels])
+    chosen = {}
+    for number, level in enumerate(levels):
+        depths = _depths_in_image(level, points)
+        if len(depths) < _LEAST_POINTS:
+            continue
+        nearest, median, farthest = np.percentile(depths, _PERCENTILES, method="lower")
+        distance = np.sqrt(np.square(positions - positions[number]).sum(axis=1))
+        facing = (axes * axes[number]).sum(axis=1)
+        able = (distance >= _LEAST_PARALLAX * median) & (facing >= _LEAST_COSINE)
+        neighbours = [int(n) for n in np.argsort(distance, kind="stable") if able[n]]
+        if neighbours:
+            far, near = 1 / (farthest * _MARGIN), _MARGIN / nearest
+            moves = _displacement(level, [levels[n] for n in neighbours[:NEIGHBOURS]], far, near)
+            count = int(np.clip(np.ceil(moves / _STEP) + 1, *_PLANES))
+            chosen[number] = Planes(np.linspace(far, near, count, dtype=np.float32), neighbours)
+    return chosen
+
+
+def _depths_in_image(level: Level, points: Doubles) -> Doubles:
+    x, y, depth = level.project(points)
+    height, width = level.gray.shape
+    inside = (x >= 0) & (x <= width) & (y >= 0) & (y <= height)  # false for nan
+    depths: Doubles = depth[inside]
+    return depths
+
+
+def _displacement(level: Level, others: Sequence[Level], far: float, near: float) -> float:
+    """How far the image of the central pixel moves between two inverse depths, px, in the median.
+
+    The median is one of the views' values.
+    """
+    row, column = (size // 2 for size in level.gray.shape)
+    moves = []
+    for other in others:
+        directions, shift = level.towards(other)
+        (x0, y0), (x1, y1) = (
+            (x / max(z, 1e-3), y / max(z, 1e-3))
+            for inverse_depth in (far, near)
+            for x, y, z in [
+                [a[row, column] + b * inverse_depth for a, b in zip(directions, shift, strict=True)]
+            ]
+        )
+        moves.append(float(np.hypot(x1 - x0, y1 - y0)))
+    return sorted(moves)[len(moves) // 2]
+
+
+def sweep(views: Sequence[SweptView], planes: Planes, number: int) -> DepthMap:
+    """Find the depths of one view.
+
+    Args:
+        views: All views.
+        planes: The planes of the view.
+        number: The number of the view.
+    """
+    view, nearest = views[number], planes.neighbours[:NEIGHBOURS]
+    inverse_depths = planes.inverse_depths[:, None, None]
+    volume = costs(view.coarse, [views[n].coarse for n in nearest], inverse_depths)
+    coarse = planes.inverse_depths[0] + planes.step * minimum(smoothed(volume))
+    fine = _refined(view, [views[n] for n in planes.neighbours], planes, coarse)
+    return DepthMap(view, fine, view.finest.used, float(planes.step), nearest)
+
+
+def _refined(
+    view: SweptView, neighbours: Sequence[SweptView], planes: Planes, coarse: Floats
+) -> Floats:
+    """Compare depths [h, w] about those of the coarse level on the finest one."""
+    if view.fine is not None:
+        fine = [other for other in neighbours if other.fine is not None]
+        neighbours = fine if len(fine) >= _LEAST_FINE else neighbours
+    level, others = view.finest, [other.finest for other in neighbours[:NEIGHBOURS]]
+    far, near = planes.inverse_depths[0], planes.inverse_depths[-1]
+    step = planes.step * _displacement(level, others, float(far), float(near)) / (near - far)
+    reach = int(np.clip(np.ceil(step / _STEP), *_REACH))
+    offsets = np.arange(-reach, reach + 1, dtype=np.float32) * (planes.step / np.float32(reach))
+    depths = enlarged(coarse, *level.gray.shape)
+    for _ in range(_REFINEMENTS):
+        around = np.maximum(depths + offsets[:, None, None], far / 2)
+        place = minimum(smoothed(costs(level, others, around)))
+        depths = np.maximum(depths + offsets[0] + (offsets[1] - offsets[0]) * place, far / 2)
+        depths = evened(median_filter(depths, _WINDOW, mode="nearest"), planes.step)
+    return depths
+
+
+def evened(image: Floats, range_: np.float32) -> Floats:
+    """The mean [h, w] of each pixel's window, over the values near its own.
+
+    Args:
+        image: [h, w]
+        range_: Values count that differ from the pixel's own by at most this.
+    """
+    height, width = image.shape
+    total, number = np.zeros_like(image), np.zeros_like(image)
+    padded = np.pad(image, _WINDOW // 2, mode="edge")
+    for row in range(_WINDOW):
+        for column in range(_WINDOW):
+            other = padded[row : row + height, column : column + width]
+            near = np.abs(other - image) <= range_
+            total += np.where(near, other, 0)
+            number += near
+    return total / number
+
+
+def enlarged(image: Floats, height: int, width: int) -> Floats:
+    """Enlarge an image [h, w], bilinear: [height, width]."""
+    for axis, new in enumerate((height, width)):
+        old = image.shape[axis]
+        place = np.clip((np.arange(new) + 0.5) * old / new - 0.5, 0, old - 1)
+        before = place.astype(np.int64)
+        share = np.expand_dims((place - before).astype(np.float32), 1 - axis)
+        first, second = (np.take(image, np.minimum(before + n, old - 1), axis=axis) for n in (0, 1))
+        image = first + share * (second - first)
+    return image

@@ -1,0 +1,81 @@
+"""Semi-global matching [hirschmuller2008]: the costs of depths, smoothed along lines."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from xrgs.training.dense.levels import Floats
+
+STEP = 0.015
+"""The penalty of a pixel whose depth is one plane from its neighbour's; our choice."""
+JUMP = 0.2
+"""The penalty of any larger difference; our choice."""
+
+
+def smoothed(costs: Floats) -> Floats:
+    """Sum the costs along the lines that lead to each pixel from left, right, above and below.
+
+    Along a line, with p' the pixel before p,
+
+        L(p, d) = C(p, d) + min(L(p', d), L(p', d - 1) + P1, L(p', d + 1) + P1, m + P2) - m
+
+    where m is the minimum of L(p', .) over the depths.
+
+    Args:
+        costs: C [D, h, w].
+
+    Returns:
+        [D, h, w] the sum of L over the four directions.
+    """
+    by_column = _both_ways(np.ascontiguousarray(costs.transpose(2, 0, 1)))  # [w, D, h]
+    by_row = _both_ways(np.ascontiguousarray(costs.transpose(1, 0, 2)))  # [h, D, w]
+    total: Floats = by_column.transpose(1, 2, 0) + by_row.transpose(1, 0, 2)
+    return total
+
+
+def _both_ways(costs: Floats) -> Floats:
+    """The sum of L along the first axis, forward and backward, of costs [n, D, m]."""
+    total = np.empty_like(costs)
+    path = costs[0]
+    total[0] = path
+    for place in range(1, len(costs)):
+        path = _next(path, costs[place])
+        total[place] = path
+    path = costs[-1]
+    total[-1] += path
+    for place in range(len(costs) - 2, -1, -1):
+        path = _next(path, costs[place])
+        total[place] += path
+    return total
+
+
+def _next(path: Floats, costs: Floats) -> Floats:
+    """L of the next pixels of m lines, of L [D, m] and the pixels' costs [D, m]."""
+    least = path.min(axis=0)
+    reached: Floats = np.minimum(path, least + np.float32(JUMP))
+    np.minimum(reached[1:], path[:-1] + np.float32(STEP), out=reached[1:])
+    np.minimum(reached[:-1], path[1:] + np.float32(STEP), out=reached[:-1])
+    reached -= least
+    reached += costs
+    return reached
+
+
+def minimum(costs: Floats) -> Floats:
+    """The place of the least cost of each pixel, between planes by a parabola through three.
+
+    Args:
+        costs: [D, h, w], at least 3 planes.
+
+    Returns:
+        [h, w] in 0..D - 1.
+    """
+    planes = len(costs)
+    place = costs.argmin(axis=0)
+    inner = np.clip(place, 1, planes - 2)
+    before, at, after = (
+        np.take_along_axis(costs, (inner + shift)[None], axis=0)[0] for shift in (-1, 0, 1)
+    )
+    bend = np.maximum(before - 2 * at + after, np.float32(1e-9))
+    between = np.where(place == inner, (before - after) / (2 * bend), 0)
+    result: Floats = place.astype(np.float32) + np.clip(between, -0.5, 0.5).astype(np.float32)
+    return result

@@ -1,0 +1,135 @@
+"""The surfaces of a scene, as squares of even colour at the depths of the views' pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from xrgs.runtime.machine import single_torch_thread
+from xrgs.runtime.progress import progress
+from xrgs.training.dense.checks import consistent, not_seen_through, owned
+from xrgs.training.dense.depths import DepthMap, choose_planes, sweep
+from xrgs.training.dense.levels import Bools, Doubles, SweptView
+from xrgs.training.dense.quadtree import Quadtree, limit_for
+
+_CELLS = 24
+"""Coverage is counted in cells, this many along the longer side of a view; our choice."""
+
+
+@dataclass(frozen=True)
+class Squares:
+    """Squares on the surfaces of a scene, N of them."""
+
+    points: Doubles
+    """[N, 3] their centres, world units."""
+    colors: Doubles
+    """[N, 3] in 0..1."""
+    sides: Doubles
+    """[N] world units."""
+
+
+def find_depths(views: Sequence[SweptView], points: Doubles) -> dict[int, DepthMap]:
+    """Sweep every view, and check its depths against those of others.
+
+    Args:
+        views: The training views.
+        points: SfM points [P, 3], world units.
+
+    Returns:
+        The depths by the numbers of the views, without the views that can't be swept.
+    """
+    planes = choose_planes(views, points)
+    # A thread for each view, and one thread within: the bits are the same for any number.
+    with single_torch_thread() as threads, ThreadPoolExecutor(threads) as pool:
+        swept = pool.map(lambda number: sweep(views, planes[number], number), planes)
+        found = dict(zip(planes, progress(swept, "dense start", "view", len(planes)), strict=True))
+        for check in (consistent, not_seen_through):
+            passed = list(pool.map(partial(check, found), found))
+            found = {
+                number: replace(depths, good=good)
+                for (number, depths), good in zip(found.items(), passed, strict=True)
+            }
+    return found
+
+
+def cover(maps: Sequence[DepthMap], budget: int) -> Squares:
+    """Cover the good pixels of all views by squares, each place of the scene once.
+
+    A place belongs to the view that samples the scene most finely among those that have it. The
+    squares are the leaves of quadtrees, split where the colours of a photograph differ most.
+
+    Args:
+        maps: The depths of the views, with at least one good pixel among them.
+        budget: The most squares, unless the largest squares of the quadtrees are more.
+    """
+    ordered = sorted(maps, key=lambda each: -each.view.photograph.rho)
+    of_views = zip(ordered, owned(ordered), strict=True)
+    having = [(each, pixels) for each, pixels in of_views if pixels.any()]
+    focal = [each.view.photograph.camera.numbers.intrinsics[0] for each, _ in having]
+    trees = [
+        Quadtree(
+            each.view.photograph.image.numpy(),
+            _on_photograph(each, pixels),
+            # Errors count by the angle that a pixel takes, so that coarse views are split too.
+            weight=(max(focal) / own) ** 2,
+        )
+        for (each, pixels), own in zip(having, focal, strict=True)
+    ]
+    limit = limit_for(trees, budget)
+    parts = [_squares(each, tree, limit) for (each, _), tree in zip(having, trees, strict=True)]
+    return Squares(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+
+
+def _on_photograph(depths: DepthMap, pixels: Bools) -> Bools:
+    """Bring pixels [h, w] of a view's finest level to the size of its photograph."""
+    camera = depths.view.photograph.camera
+    rows, columns = (
+        ((np.arange(new) + 0.5) * old / new).astype(np.int64)
+        for new, old in zip((camera.height, camera.width), pixels.shape, strict=True)
+    )
+    enlarged: Bools = pixels[rows[:, None], columns]
+    return enlarged
+
+
+def _squares(depths: DepthMap, tree: Quadtree, limit: float) -> tuple[Doubles, Doubles, Doubles]:
+    """The points, colours and sides of the leaves of a view's quadtree."""
+    leaves, level, camera = tree.leaves(limit), depths.level, depths.view.photograph.camera
+    height, width = depths.good.shape
+    down, across = height / camera.height, width / camera.width  # px of the level, of a px
+    row, column = (
+        ((nearest + 0.5) * scale).astype(np.int64)
+        for nearest, scale in zip(leaves.nearest, (down, across), strict=True)
+    )
+    depth = 1 / depths.inverse_depth[row, column].astype(np.float64)
+    points = level.to_world(leaves.x * across, leaves.y * down, depth)
+    # The level's focal length, px of the photograph.
+    sides = np.sqrt(leaves.pixels) * depth * across / level.focal[0]
+    return points, leaves.colors, sides
+
+
+def share_good(views: Sequence[SweptView], maps: Sequence[DepthMap]) -> float:
+    """The share of the views' pixels inside masks whose depths hold, in the mean of the views."""
+    shares = (each.good.sum() / max(each.level.used.sum(), 1) for each in maps)
+    return float(sum(shares)) / len(views)
+
+
+def share_covered(views: Sequence[SweptView], points: Doubles) -> float:
+    """The share of the views' cells inside masks that points [P, 3] are in, in their mean."""
+    shares = []
+    for view in views:
+        height, width = view.coarse.used.shape
+        cell = max(height, width) / _CELLS  # px
+        x, y, _ = view.coarse.project(points)
+        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)  # false for nan
+        rows, columns = (int(np.ceil(size / cell)) for size in (height, width))
+        covered = np.zeros((rows, columns), bool)
+        covered[(y[inside] / cell).astype(np.int64), (x[inside] / cell).astype(np.int64)] = True
+        row, column = np.nonzero(view.coarse.used)
+        used = np.zeros_like(covered)
+        used[(row / cell).astype(np.int64), (column / cell).astype(np.int64)] = True
+        shares.append((covered & used).sum() / max(used.sum(), 1))
+    return float(np.mean(shares))
