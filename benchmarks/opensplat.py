@@ -45,9 +45,16 @@ class Snapshot:
 
 
 def version(binary: str) -> str:
-    """Return the name and the version of the binary."""
+    """Return the name and the version of the program.
+
+    Raises:
+        SystemExit: It does not run.
+    """
     command = [binary, "--version"]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)  # noqa: S603
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=True)  # noqa: S603
+    except (OSError, subprocess.CalledProcessError) as error:
+        raise SystemExit(f"--opensplat {binary}: {error}") from error
     return f"OpenSplat {done.stdout.strip()}"
 
 

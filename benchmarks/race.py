@@ -33,6 +33,7 @@ import race_table
 from race_table import Run
 
 import xrgs
+from xrgs.capture import dataset
 from xrgs.experiment.provenance import this_processor
 from xrgs.experiment.results import cell_metrics
 from xrgs.experiment.store import BASELINE, Store
@@ -53,7 +54,7 @@ RACES = {
     504: ((1.0, 3.0, 10.0), _SEVEN),
     1008: ((10.0, 30.0), ("llff/fern", "llff/horns", "llff/room", "llff/trex")),
 }
-ARMS = ("fast", "plus", "lean", "keep_large", BASELINE)
+ARMS = ("fast", "plus", "lean", "tuned_baseline", BASELINE)
 #: OpenSplat as it is, stopped at each budget; and with the steps and the schedules for a budget.
 PEERS = ("opensplat", "opensplat_planned")
 #: Steps between two .ply files of the first.
@@ -212,8 +213,8 @@ class Race:
     ) -> Iterator[dict[str, Any]]:
         """Yield the rows of a run of OpenSplat; `minutes` has the budget of each limit in s."""
         cells = {(run.size, run.scene): run.cell for run in self.runs if run.cell}
-        cell = self.store.cell(cells[start.size, start.scene])  # any: the photographs are the same
-        data, conf = cell.dataset(), cell.config()
+        cell = self.store.cell(cells[start.size, start.scene])  # any: they have one variant
+        data, conf = dataset.load(cell.variant()), cell.config()
         folder = self.folder / "opensplat" / str(start.size)
         photographs = folder / "data" / conf.scene.name
         photographs.parent.mkdir(parents=True, exist_ok=True)

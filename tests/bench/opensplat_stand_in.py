@@ -11,10 +11,14 @@ import sys
 import time
 import zlib  # noqa: F401  pycolmap 4.2.1 corrupts the heap where it is imported before zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement
+
+Array = NDArray[Any]
 
 SECONDS_A_STEP, SECONDS_A_FILE = 0.002, 0.05
 C0 = 0.28209479177387814  # of the spherical harmonics of band 0
@@ -51,11 +55,12 @@ def main() -> None:
     save(table, args.o)
 
 
-def vertices(means: np.ndarray, colors: np.ndarray) -> np.ndarray:
+def vertices(means: Array, colors: Array) -> Array:
     """One opaque Gaussian for each point, as large as its distance to the nearest other point."""
     apart = np.linalg.norm(means[:, None] - means[None], axis=2)
     np.fill_diagonal(apart, np.inf)
-    columns = dict(zip("xyz", means.T, strict=True)) | dict.fromkeys(("nx", "ny", "nz"), 0.0)
+    columns: dict[str, Any] = dict(zip("xyz", means.T, strict=True))
+    columns |= dict.fromkeys(("nx", "ny", "nz"), 0.0)
     sh0 = (colors / 255 - 0.5) / C0
     columns |= {f"f_dc_{channel}": sh0[:, channel] for channel in range(3)}
     columns |= dict.fromkeys((f"f_rest_{number}" for number in range(45)), 0.0)
@@ -68,7 +73,7 @@ def vertices(means: np.ndarray, colors: np.ndarray) -> np.ndarray:
     return table
 
 
-def save(table: np.ndarray, file: Path) -> None:
+def save(table: Array, file: Path) -> None:
     time.sleep(SECONDS_A_FILE)
     PlyData([PlyElement.describe(table, "vertex")]).write(file)
     say(f"Wrote {file}")

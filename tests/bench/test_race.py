@@ -7,7 +7,7 @@ import importlib
 import math
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -96,7 +96,7 @@ def test_runs_are_read_as_they_were_written(race: Any, tmp_path: Path) -> None:
     assert race.race_table.read(tmp_path / "none") == []
 
 
-def scenes(race: Any, arm: str, psnr: Sequence[float], lpips: Sequence[float]) -> list[Any]:
+def scenes(race: Any, arm: str, psnr: Iterable[float], lpips: Iterable[float]) -> list[Any]:
     return [
         made(race, arm=arm, scene=f"scene{number}", psnr=p, lpips=q)
         for number, (p, q) in enumerate(zip(psnr, lpips, strict=True))
@@ -151,7 +151,7 @@ def test_a_pixel_without_gaussians_has_opensplats_background(race: Any, tmp_path
     )
     nothing.quats.fill_(1.0)
     scores = race.opensplat.score(nothing, [view], compose().splat, tmp_path / "renders")
-    background = np.broadcast_to(np.float32([0.6130, 0.0101, 0.3984]), (24, 32, 3))
+    background = np.broadcast_to(np.array([0.6130, 0.0101, 0.3984], np.float32), (24, 32, 3))
     expected = peak_signal_noise_ratio(photograph / 255, background, data_range=1)
     assert scores["psnr"] == pytest.approx(expected, rel=1e-6)
 
