@@ -97,7 +97,8 @@ def train(
         The last .ply within each limit, by the limit, where there is one. Others are removed.
 
     Raises:
-        SystemExit: It has failed; the message has the end of what it said.
+        SystemExit: It has failed, and the message has the end of what it said; or it has written
+            no .ply within a limit.
     """
     saving = ("--keep-crs", "--save-every", str(every), "-o", str(out / "splat.ply"))
     errors = out / "stderr.txt"
@@ -117,6 +118,8 @@ def train(
             process.kill()
     if failed:
         raise SystemExit(f"{binary} {' '.join(options)}: {errors.read_text()[-2000:]}")
+    if not kept:
+        raise SystemExit(f"{binary} {' '.join(options)}: no .ply within {max(limits_s):g} s")
     return kept
 
 

@@ -58,7 +58,7 @@ ARMS = ("fast", "plus", "lean", "tuned_baseline", BASELINE)
 #: OpenSplat as it is, stopped at each budget; and with the steps and the schedules for a budget.
 PEERS = ("opensplat", "opensplat_planned")
 #: Steps between two .ply files of the first.
-_PEER_EVERY = 100
+_PEER_EVERY = 10
 #: Of the second: its options that are numbers of steps, with their defaults.
 _PEER_SCHEDULES = {
     "resolution-schedule": 3000,
