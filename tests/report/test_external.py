@@ -16,6 +16,7 @@ from skimage.metrics import peak_signal_noise_ratio
 
 from xrgs.capture import frozen
 from xrgs.capture.views import Variant, View
+from xrgs.errors import XrgsError
 from xrgs.report import build
 from xrgs.report.collect import ReportError
 from xrgs.report.external import External, parse, with_external
@@ -135,6 +136,39 @@ def test_each_draw_of_a_variant_has_a_folder_of_its_own(
     rows = with_external(sweep, JoinedStore((made.store,)), [other]).cells.tail(2)
     assert list(rows["variant_seed"]) == [0, 1]
     assert rows["psnr"].iloc[0] - rows["psnr"].iloc[1] == pytest.approx(20 * np.log10(2), abs=0.01)
+
+
+def test_what_its_training_took_stands_in_the_row(
+    made: MakeStore, frozen_variant: Callable[..., str], tmp_path: Path
+) -> None:
+    made.add(variant=frozen_variant())
+    sweep = made.read()
+    folder = rendered(tmp_path / "r")
+    (folder / "figures.json").write_text('{"training_time_s": 61.5, "gaussians": 41230}')
+    row = with_external(sweep, JoinedStore((made.store,)), [External("o", folder)]).cells.iloc[-1]
+    assert (row["training_time_s"], row["gaussians"]) == (61.5, 41230)
+    assert pd.isna(row[["memory_bytes", "peak_rss_bytes", "evaluations"]]).all()
+
+
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [
+        ('{"seconds": 3}', "unknown field `seconds`"),
+        ('{"gaussians": 0}', "gaussians: .*> 0"),
+        ('{"gaussians": "many"}', "gaussians: .*got `str`"),
+        ('{"training_time_s": NaN}', "not valid JSON"),
+        ("[]", "got `array`"),
+    ],
+)
+def test_wrong_figures_are_refused(
+    made: MakeStore, frozen_variant: Callable[..., str], tmp_path: Path, content: str, why: str
+) -> None:
+    made.add(variant=frozen_variant())
+    sweep = made.read()
+    folder = rendered(tmp_path / "r")
+    (folder / "figures.json").write_text(content)
+    with pytest.raises(XrgsError, match=rf"{folder}/figures\.json: .*{why}"):
+        with_external(sweep, JoinedStore((made.store,)), [External("o", folder)])
 
 
 def broken(folder: Path, how: str) -> None:

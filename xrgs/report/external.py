@@ -3,15 +3,18 @@
 They are scored by the metrics of the frozen protocol against the photographs of the variant, and
 compared by the same statistics. They are 8-bit PNGs, and our own cells are scored as float32
 images: the rounding costs PSNR 0.005 dB at 30 dB and 0.05 dB at 40 dB, and SSIM 0.0004 on the
-embedded scene. Time, Gaussians and memory are not known: these are n/a.
+embedded scene. Time, Gaussians and memory are known where a file beside the renders has them
+(`Figures`), else n/a.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+import msgspec
 import pandas as pd
+from msgspec import Meta
 
 from xrgs.capture import variant
 from xrgs.capture.images import ImageError
@@ -23,6 +26,7 @@ from xrgs.report.collect import ReportError, Sweep
 from xrgs.runtime.progress import progress
 from xrgs.safeio.files import is_inside
 from xrgs.safeio.paths import user_path
+from xrgs.safeio.records import read_struct
 from xrgs.safeio.sanitize import for_file_name
 
 if TYPE_CHECKING:
@@ -36,6 +40,19 @@ if TYPE_CHECKING:
 _VARIANT = ["scene", "condition", "variant_seed"]
 #: What the row has in common with the cells that it is compared with.
 _SHARED = [*("variant_id", "baseline_id", "seed"), "validation", "long_side", "factor"]
+
+FIGURES = "figures.json"
+_Measured = Annotated[float, Meta(gt=0, le=1e30)] | None
+
+
+class Figures(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """`figures.json`, beside the renders of a scene: what the other program's training took."""
+
+    training_time_s: _Measured = None
+    """Seconds of training, on the machine of the cells that it is compared with."""
+    gaussians: _Measured = None
+    memory_bytes: _Measured = None
+    peak_rss_bytes: _Measured = None
 
 
 @dataclass(frozen=True)
@@ -83,7 +100,8 @@ def with_external(sweep: Sweep, store: JoinedStore, externals: Sequence[External
         store: The stores that have the sweep's variants.
         externals: The programs' renders: `<view>.png` for each scored view, in the folder
             `<scene>/<variant.seed>/`. Where a scene has one draw of HR views, `<scene>/` will do;
-            where the sweep also has one scene, the folder itself.
+            where the sweep also has one scene, the folder itself. `figures.json` beside them may
+            have numbers of the training.
 
     Returns:
         The sweep with these rows in `cells` and `views`, and their folders in `renders`.
@@ -91,6 +109,7 @@ def with_external(sweep: Sweep, store: JoinedStore, externals: Sequence[External
     Raises:
         ReportError: Cells have a label of the renders, a folder or a render is missing, or a render
             is not an 8-bit RGB PNG of its view's size. The message names the file and the format.
+        StoreError: A `figures.json` has another key or a value that is no number above 0.
         CorruptVariant: A variant is damaged.
     """
     for one in externals:
@@ -121,6 +140,7 @@ def _with_one(sweep: Sweep, store: JoinedStore, one: External) -> Sweep:
             {key: cell[key] for key in (*_VARIANT, *_SHARED, "protocol")}
             | {f"{name}_code": scoring_code()[name] for name in VIEW_METRICS}
             | {"cell_id": cell_id, "label": one.label, "state": "done"}
+            | _figures(folder)
             | dict.fromkeys(("reason", "stale", "machine"), "")
         )
     views = pd.DataFrame(scores, columns=list(sweep.views.columns)).astype(sweep.views.dtypes)
@@ -156,6 +176,12 @@ def _folder(one: External, cell: Mapping[Hashable, Any], done: pd.DataFrame) -> 
             f"{wanted} is expected, with <view>.png for each view that is scored"
         )
     return found[0]
+
+
+def _figures(folder: Path) -> dict[str, float | None]:
+    """Return what is known of the training, by metric."""
+    file = folder / FIGURES
+    return msgspec.structs.asdict(read_struct(file, Figures) if file.exists() else Figures())
 
 
 def _expected(store: JoinedStore, variant_id: str, split: str) -> dict[str, View]:

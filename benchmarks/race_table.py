@@ -1,0 +1,230 @@
+"""The runs of a race as a file, as tables and as a picture."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import os
+import re
+import sys
+from dataclasses import dataclass, fields
+from statistics import fmean
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib import style
+from matplotlib.figure import Figure
+
+from xrgs.report.inference import difference, half_width, log_ratio
+from xrgs.report.markup import to_markdown
+from xrgs.report.writing import interval, signed
+from xrgs.runtime.text import TextTable
+from xrgs.safeio.atomic import atomic_writer, write_text
+from xrgs.safeio.records import read_table
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+    from matplotlib.axes import Axes
+
+RUNS = "race.csv"
+SCORES = ("psnr", "ssim", "lpips")
+#: Other programs take less than this many cores on a machine that is quiet enough; our choice.
+QUIET = 0.1
+#: How the values of a file become those of a run.
+_KINDS = {"int": int, "float": float, "str": str}
+_MEANS = ("steps", "seconds", "gaussians", "psnr", "lpips")
+_PANELS = {"psnr": "PSNR, dB", "lpips": "LPIPS"}
+_MARKS = "os^DvPX*"
+_PLACE = re.compile(r"(?<=<!-- race -->\n).*(?=<!-- end of the race -->)", re.DOTALL)
+
+
+@dataclass(frozen=True)
+class Run:
+    """A row of `race.csv`."""
+
+    size: int
+    """The longer side of an HR photograph, px."""
+    scene: str
+    arm: str
+    minutes: float
+    """The budget for which it was planned, or made to plan another."""
+    steps: int
+    seconds: float
+    """What its training took, without loading, writing and scoring."""
+    psnr: float
+    ssim: float
+    lpips: float
+    """Means over the test views; NaN where there are no weights of LPIPS."""
+    gaussians: int
+    bytes: int
+    """The size of the .ply file."""
+    others: float
+    """Cores that other programs used meanwhile."""
+    machine: str
+    program: str
+    cell: str = ""
+    """The id of the cell of a run of our own."""
+
+
+def read(folder: Path) -> list[Run]:
+    """Read the runs of a race; none where it has not begun.
+
+    Raises:
+        StoreError: The file is damaged.
+    """
+    if not (folder / RUNS).exists():
+        return []
+    header, rows = read_table(folder / RUNS)
+    kinds = {field.name: _KINDS[str(field.type)] for field in fields(Run)}
+    return [
+        Run(**{name: kinds[name](text) for name, text in zip(header, row, strict=True)})
+        for row in rows
+    ]
+
+
+def line(run: Run) -> str:
+    """Describe a run in a line."""
+    where = f"{run.size} px, {run.scene}, {run.arm}"
+    made = f"{run.steps} steps in {run.seconds:.1f} s of {60 * run.minutes:.0f}"
+    scores = f"{run.psnr:.2f} dB, LPIPS {run.lpips:.3f}, {run.gaussians} Gaussians"
+    return f"{where}: {made}: {scores}; other programs took {run.others:.2f} cores"
+
+
+def chosen(runs: Sequence[Run], size: int, minutes: float) -> dict[tuple[str, str], Run]:
+    """Return the longest run within a budget, by arm and scene."""
+    within = [run for run in runs if run.size == size and run.seconds <= 60 * minutes]
+    return {(run.arm, run.scene): run for run in sorted(within, key=lambda run: run.seconds)}
+
+
+def budgets(runs: Sequence[Run]) -> list[tuple[int, float]]:
+    """Return the sizes and the minutes of a race, in order."""
+    return sorted({(run.size, run.minutes) for run in runs})
+
+
+def write(folder: Path, page: Path | None, against: str) -> None:
+    """Write tables and a picture of a race, and put the tables into a page.
+
+    Args:
+        folder: The folder of the race.
+        page: A Markdown page with a place for them; None for none.
+        against: The arm that others are compared with; empty for OpenSplat, or without it for the
+            baseline.
+
+    Raises:
+        SystemExit: The race has no run, or the page no place.
+    """
+    runs = read(folder)
+    if not runs:
+        raise SystemExit(f"{folder}: no race, {RUNS} is missing")
+    base = against or ("opensplat" if any(run.arm == "opensplat" for run in runs) else "baseline")
+    texts = [to_markdown(table(runs, *budget, base)) for budget in budgets(runs)]
+    text = "\n".join((*texts, "\n".join(notes(runs))))
+    write_text(folder / "table.md", f"{text}\n")
+    picture = folder / "race.png"
+    with atomic_writer(picture) as stream, style.context("default"):
+        figure(runs).savefig(stream, format="png", dpi=150, metadata={"Software": "xrgs"})
+    if page is not None:
+        content = page.read_text(encoding="utf-8")
+        shown = f"![Quality over minutes]({os.path.relpath(picture, page.parent)})\n\n{text}\n"
+        filled, places = _PLACE.subn(lambda _: shown, content)
+        if places != 1:
+            raise SystemExit(f"{page}: it must have one place for a race, it has {places}")
+        write_text(page, filled)
+    sys.stdout.write(text + "\n")
+
+
+def table(runs: Sequence[Run], size: int, minutes: float, base: str) -> TextTable:
+    """Make the table of a budget.
+
+    Args:
+        runs: All runs.
+        size: The longer side of an HR photograph, px.
+        minutes: The budget.
+        base: The arm that others are compared with.
+    """
+    found = chosen(runs, size, minutes)
+    rows = []
+    for arm in dict.fromkeys(run.arm for run in runs if run.size == size):
+        own = [run for (name, _), run in found.items() if name == arm]
+        if not own:
+            rows.append((arm, "0", *[""] * 7))
+            continue
+        mean = {name: fmean(getattr(run, name) for run in own) for name in _MEANS}
+        scores = (f"{mean['psnr']:.2f}", f"{mean['lpips']:.3f}")
+        counts = (f"{mean[name]:,.0f}" for name in ("steps", "seconds", "gaussians"))
+        changes = (_change(found, arm, base, score) for score in ("psnr", "lpips"))
+        rows.append((arm, str(len(own)), *counts, *scores, *changes))
+    return TextTable(
+        title=f"{minutes:g} min of training, {size} px",
+        columns=(
+            *("arm", "scenes", "steps", "seconds", "Gaussians", "PSNR, dB", "LPIPS"),
+            *(f"PSNR from {base}, dB", f"LPIPS from {base}, %"),
+        ),
+        rows=tuple(rows),
+        align="lrrrrrrll",
+    )
+
+
+def _change(found: Mapping[tuple[str, str], Run], arm: str, base: str, score: str) -> str:
+    """Write the mean change of a score over scenes, its 95 % interval, and how many gain."""
+    scenes = [scene for name, scene in found if name == arm and (base, scene) in found]
+    if arm == base or not scenes:
+        return ""
+    values = [
+        np.array([getattr(found[name, scene], score) for scene in scenes]) for name in (base, arm)
+    ]
+    is_ratio = score == "lpips"
+    changes, _ = (log_ratio if is_ratio else difference)(*values)
+    n = len(changes)
+    mean = changes.mean()
+    half = half_width(changes.std(ddof=1), np.array(n)) if n > 1 else math.nan
+    shown = np.array([mean, mean - half, mean + half])
+    shown = 100 * np.expm1(shown) if is_ratio else shown
+    better = int((changes < 0).sum() if is_ratio else (changes > 0).sum())
+    around = f" ({interval(*shown[1:])})" if n > 1 else ""
+    return f"{signed(shown[0])}{around}, better on {better} of {n}"
+
+
+def notes(runs: Sequence[Run]) -> list[str]:
+    """Say what the numbers depend on, in lines of Markdown."""
+    programs = ", ".join(dict.fromkeys(run.program for run in runs))
+    lines = [
+        f"- {runs[0].machine}; {programs}.",
+        "- Means over scenes of the longest run within the budget. In brackets: the 95 % interval"
+        " (Student's t) of the change over scenes.",
+    ]
+    if not any(run.arm.startswith("opensplat") for run in runs):
+        lines.append("- OpenSplat was not run.")
+    others = max(run.others for run in runs)
+    if others > QUIET:
+        lines.append(f"- **No result:** other programs used up to {others:.1f} cores meanwhile.")
+    return lines
+
+
+def figure(runs: Sequence[Run]) -> Figure:
+    """Draw PSNR and LPIPS over minutes, a row of panels for each size."""
+    sizes = sorted({size for size, _ in budgets(runs)})
+    drawn = Figure(figsize=(11, 4.2 * len(sizes)), layout="constrained")
+    panels = drawn.subplots(len(sizes), 2, squeeze=False)
+    for row, size in zip(panels, sizes, strict=True):
+        for axes, (score, name) in zip(row, _PANELS.items(), strict=True):
+            _draw(axes, runs, size, score)
+            axes.set(title=f"{size} px", xlabel="minutes of training on two cores", ylabel=name)
+            axes.legend()
+    return drawn
+
+
+def _draw(axes: Axes, runs: Sequence[Run], size: int, score: str) -> None:
+    times = [minutes for at, minutes in budgets(runs) if at == size]
+    means: dict[str, list[tuple[float, float]]] = {}
+    for minutes in times:
+        found = chosen(runs, size, minutes)
+        for arm in dict.fromkeys(arm for arm, _ in found):
+            own = [getattr(run, score) for (name, _), run in found.items() if name == arm]
+            means.setdefault(arm, []).append((minutes, fmean(own)))
+    for (arm, points), mark in zip(sorted(means.items()), itertools.cycle(_MARKS)):
+        axes.plot(*zip(*points, strict=True), marker=mark, label=arm)
+    axes.set(xscale="log", xticks=times, xticklabels=[f"{minutes:g}" for minutes in times])
+    axes.minorticks_off()
