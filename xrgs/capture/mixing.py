@@ -103,8 +103,9 @@ def mix_resolutions(scene: Scene, conf: VariantConf, work: Path, out: Path) -> V
     report |= tags | masked | blurred | {"notes": notes}
     report["seconds"] = round(time.perf_counter() - start, 1)
     held_out = bool(inputs.split.test)
+    points, colors = model.points, model.colors
     return Variant(
-        "", out, scene.name, conf.factor, held_out, views, model.points, model.colors, report
+        "", out, scene.name, conf.factor, held_out, views, points, colors, report, model.world
     )
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import tempfile
 import zlib  # noqa: F401  pycolmap 4.2.1 corrupts the heap where it is imported before zlib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -77,6 +77,8 @@ class Reconstruction:
     """Indices of the points that were found in each image, ascending."""
     report: dict[str, Any]
     """Settings and results, by the keys that the variant's report has."""
+    world: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
+    """The rigid transform [4, 4] from the world of given poses to this one."""
 
 
 def features_per_image(images: int, configured: int) -> int:

@@ -40,6 +40,7 @@ CORE = (
     "capture/alignment.py",
     "capture/colour.py",
     "capture/deep.py",
+    "capture/exif.py",
     "capture/frozen.py",
     "capture/images.py",
     "capture/lens.py",
@@ -58,9 +59,11 @@ CORE = (
 POSES = (
     "capture/colmap.py",
     "capture/poses/__init__.py",
+    "capture/poses/checks.py",
     "capture/poses/colmap.py",
     "capture/poses/given.py",
     "capture/poses/transforms.py",
+    "capture/poses/world.py",
     "capture/triangulation.py",
 )
 
