@@ -15,7 +15,7 @@ from xrgs.capture import images
 if TYPE_CHECKING:
     from pathlib import Path
 
-_MAKE, _MODEL, _DETAILS = 0x010F, 0x0110, 0x8769
+_MAKE, _MODEL = 0x010F, 0x0110
 _FOCAL, _FOCAL_35MM = 0x920A, 0xA405  # in mm; the latter of this field of view on 35 mm film
 _DIGITAL_ZOOM, _CUSTOM_RENDERED = 0xA404, 0xA401
 _WIDTH, _HEIGHT = 0xA002, 0xA003  # of the picture as the camera saved it, px
@@ -53,10 +53,7 @@ def read(path: Path) -> Taken:
         UnreadableError: The file can't be read now.
         ImageError: The file is not an image.
     """
-    exif, xmp = images.metadata(path)
-    details: dict[int, Any] = {}
-    with suppress(Exception):  # PIL raises nearly anything on damaged EXIF
-        details = exif.get_ifd(_DETAILS)
+    exif, details, xmp = images.metadata(path)
     values = [exif.get(_MAKE), exif.get(_MODEL), details.get(_FOCAL), details.get(_FOCAL_35MM)]
     camera = "/".join("" if v is None else str(v).strip("\0 ") for v in values).strip("/")
     focal = _number(details.get(_FOCAL_35MM))

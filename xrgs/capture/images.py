@@ -537,16 +537,18 @@ def _small(image: Image.Image, side: int) -> NDArray[np.uint8]:
     return np.asarray(image.convert("L").resize((side, side), Image.Resampling.BOX))
 
 
-def metadata(path: Path) -> tuple[Image.Exif, str]:
-    """Read EXIF and XMP of a photograph; both are empty where it has none.
+def metadata(path: Path) -> tuple[Image.Exif, dict[int, Any], str]:
+    """Read EXIF of a photograph, the tags of how it was taken, and XMP; empty where it has none.
 
     Raises:
         UnreadableError: The file can't be read now.
         ImageError: The file is not an image.
     """
     with _stream(path) as stream:
-        file = _file(stream)
-        return file.exif, file.xmp
+        file, details = _file(stream), {}
+        with suppress(Exception):  # PIL raises nearly anything on damaged EXIF
+            details = file.exif.get_ifd(_EXIF_DETAILS)
+        return file.exif, details, file.xmp
 
 
 def decode(path: Path) -> Picture:

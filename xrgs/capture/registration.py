@@ -103,8 +103,8 @@ class Registration:
     model: sfm.Reconstruction
     refused: str
     """Why even the best reconstruction is not accepted; empty where it is."""
-    conf: SfmConf
-    """The settings of its attempt."""
+    attempt: Attempt
+    """How it was made."""
     attempts: list[dict[str, Any]]
     """For each attempt its name, why it was refused, its seconds, settings and results."""
 
@@ -161,7 +161,7 @@ def register(
     model, reason, attempt = best
     notes = [*model.report.get("notes", ()), *_notes(attempt, photos)]
     model = replace(model, report=model.report | {"notes": notes})
-    return Registration(model, reason, attempt.conf, reports)
+    return Registration(model, reason, attempt, reports)
 
 
 def _error(model: sfm.Reconstruction) -> float:
@@ -274,7 +274,7 @@ def _reconstruct(
 
 
 def reconstruct_undegraded(
-    photos: PhotoCollection, conf: SfmConf, work: Path
+    photos: PhotoCollection, attempt: Attempt, work: Path
 ) -> sfm.Reconstruction:
-    """Run SfM once on the undegraded photographs."""
-    return _reconstruct(photos, (), Attempt("reference", conf), work / "sfm-reference")
+    """Run SfM once on the undegraded photographs, as in an attempt."""
+    return _reconstruct(photos, (), attempt, work / "sfm-reference")

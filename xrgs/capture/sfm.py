@@ -291,7 +291,11 @@ def _with_own_cameras(model: Any) -> Any:
     options = pycolmap.BundleAdjustmentOptions(refine_extra_params=False, print_summary=False)
     options.ceres.solver_options.num_threads = 1
     options.ceres.solver_options.max_num_iterations = _OWN_ITERATIONS
-    pycolmap.bundle_adjustment(own, options)
+    config = pycolmap.BundleAdjustmentConfig()
+    for number in own.images:
+        config.add_image(number)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pycolmap.create_default_bundle_adjuster(options, config, own).solve()
     own.update_point_3d_errors()
     return own
 
