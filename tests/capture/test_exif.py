@@ -92,9 +92,7 @@ def test_a_crop_or_zoom_that_metadata_name_has_another_camera(
         {0xA002: 0, 0xA003: 0},
     ],
 )
-def test_no_zoom_and_a_smaller_copy_are_no_crop(
-    tmp_path: Path, details: dict[int, object]
-) -> None:
+def test_no_zoom_and_a_smaller_copy_are_no_crop(tmp_path: Path, details: dict[int, object]) -> None:
     assert exif.read(write(tmp_path / "a.jpg", details)).cut == ""
 
 

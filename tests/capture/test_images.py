@@ -23,7 +23,8 @@ from tests.capture.made_files import (
     png,
     with_entry,
 )
-from xrgs.capture import exif as exif_of, images
+from xrgs.capture import exif as exif_of
+from xrgs.capture import images
 from xrgs.capture.images import ImageError
 
 #: How Pillow turns a picture by its EXIF orientation; the other values change nothing.

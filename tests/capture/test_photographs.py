@@ -9,7 +9,8 @@ import pytest
 from PIL import Image
 
 from tests.capture.made_files import DISPLAY_P3, profile
-from xrgs.capture import exif as exif_of, images
+from xrgs.capture import exif as exif_of
+from xrgs.capture import images
 from xrgs.capture.photographs import (
     assign_cameras,
     largest_of_shape,

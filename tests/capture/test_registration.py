@@ -120,6 +120,81 @@ def test_where_all_are_refused_the_one_with_most_views_is_returned(
     assert done.refused == ("2 are too few" if fallbacks else "0 are too few")
 
 
+def with_exif(photos: PhotoCollection, focal: float | None) -> PhotoCollection:
+    known = (replace(photo, K=None, focal_35mm=focal) for photo in photos.all)
+    return replace(photos, all=tuple(known))
+
+
+def test_the_last_attempt_is_without_the_focal_length_of_exif(
+    photos: PhotoCollection, sfm_conf: SfmConf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: list[list[sfm.SfmImage]] = []
+
+    def reconstruct(sfm_images: list[sfm.SfmImage], *_: object) -> Reconstruction:
+        given.append(sfm_images)
+        return registered(2 if sfm_images[0].focal is None else 1)
+
+    monkeypatch.setattr(sfm, "reconstruct", reconstruct)
+    done = registration.register(
+        with_exif(photos, 300.0),
+        [1],
+        sfm_conf,
+        tmp_path,
+        lambda model: "" if len(model.viewmats) == 2 else "too few",
+    )
+    assert [a["attempt"] for a in done.attempts][-2:] == ["native", "without_exif"]
+    assert all(image.focal for images_of in given[:-1] for image in images_of)
+    assert [image.focal for image in given[-1]] == [None, None]
+    assert done.refused == ""
+    (note,) = done.model.report["notes"]
+    assert note.startswith("the focal length in EXIF (300 mm of 35 mm film) was not used")
+
+
+def test_without_a_focal_length_in_exif_there_is_no_such_attempt(
+    photos: PhotoCollection, sfm_conf: SfmConf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sfm, "reconstruct", lambda *_: registered(1))
+    done = registration.register(
+        with_exif(photos, None), [1], sfm_conf, tmp_path, lambda _: "too few"
+    )
+    assert [a["attempt"] for a in done.attempts][-1] == "native"
+
+
+@pytest.mark.parametrize(("error", "taken"), [(0.5, True), (1.5, False)])
+@pytest.mark.parametrize("views", [1, 2])
+def test_views_that_fit_another_camera_are_tried_with_one(
+    photos: PhotoCollection,
+    sfm_conf: SfmConf,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    error: float,
+    taken: bool,
+    views: int,
+) -> None:
+    given: list[list[sfm.SfmImage]] = []
+
+    def reconstruct(sfm_images: list[sfm.SfmImage], *_: object) -> Reconstruction:
+        given.append(sfm_images)
+        found = registered(2 if len(given) == 1 else views)
+        errors = {"reprojection_error_px": 1.0 if len(given) == 1 else error}
+        apart = {1: 1} if len(given) == 1 else {}
+        return replace(found, report=found.report | errors, apart=apart)
+
+    monkeypatch.setattr(sfm, "reconstruct", reconstruct)
+    known = with_exif(photos, 28.0)
+    done = registration.register(known, [1], sfm_conf, tmp_path, lambda _: "")
+    assert [a["attempt"] for a in done.attempts] == ["configured", "cameras_apart"]
+    first, second = given
+    assert second[0] == first[0]
+    assert second[1].camera not in {first[0].camera, first[1].camera}
+    assert second[1].focal is None
+    is_taken = taken and views == 2
+    assert done.attempt.apart == ({1: 1} if is_taken else {})
+    notes = done.model.report["notes"]
+    assert len(notes) == is_taken
+    assert not notes or f"{known.names[1]} fit with another focal length" in notes[0]
+
+
 def test_of_refused_attempts_with_equally_many_views_the_first_is_returned(
     photos: PhotoCollection, sfm_conf: SfmConf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -530,7 +530,12 @@ def thumbnail(path: Path, side: int) -> NDArray[np.uint8]:
             file.image.draft("RGB", (16 * side, 16 * side))
             upright = ImageOps.exif_transpose(file.image).convert("RGB")
             return _small(upright, side)
-    return _small(Image.fromarray(to_8_bit(decode(path).pixels)), side)
+    return small(decode(path).pixels, side)
+
+
+def small(image: ImageArray, side: int) -> NDArray[np.uint8]:
+    """Return a small grey picture [side, side] of an image [H, W, 3]."""
+    return _small(Image.fromarray(to_8_bit(image)), side)
 
 
 def _small(image: Image.Image, side: int) -> NDArray[np.uint8]:

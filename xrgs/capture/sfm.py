@@ -225,8 +225,8 @@ def other_cameras(model: Any, sfm_images: Sequence[SfmImage]) -> dict[int, int]:
     """Find the images that fit better with another camera than the one that they share.
 
     Each image gets a camera of its own, and focal lengths, poses and points are refined together.
-    Nothing is found unless the reprojection error falls by 3 %, and the focal lengths of some of the
-    images are then 5 % from those of the others with their camera.
+    Nothing is found unless the reprojection error falls by 3 %, and the focal lengths of some are
+    then 5 % from those of the others with their camera.
 
     Args:
         model: pycolmap's `Reconstruction`; it stays as it is.

@@ -27,6 +27,7 @@ PATCHES = [(230, 30, 30), (30, 220, 40), (30, 60, 220), (200,) * 3, (240, 200, 3
 #: From linear sRGB to linear RGB of these primaries, by ITU-R BT.2087 and by CSS Color 4.
 TO_BT2020 = [[0.6274, 0.3293, 0.0433], [0.0691, 0.9195, 0.0114], [0.0164, 0.0880, 0.8956]]
 TO_P3 = [[0.8225, 0.1775, 0], [0.0332, 0.9668, 0], [0.0171, 0.0724, 0.9105]]
+TO_BT601 = [[1.0654, -0.0554, -0.0100], [-0.0196, 1.0364, -0.0167], [0.0016, 0.0044, 0.9940]]
 TO_SRGB = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
 #: The weights of red and blue in luma of BT.601, BT.709 and BT.2020.
 BT601, BT709, BT2020 = (0.299, 0.114), (0.2126, 0.0722), (0.2627, 0.0593)
@@ -143,7 +144,7 @@ def test_a_video_held_upright_is_turned_as_a_player_does(tmp_path: Path) -> None
     ("colours", "to_primaries", "luma"),
     [
         ((2, 2, 2), TO_SRGB, BT601),
-        ((6, 6, 6), TO_SRGB, BT601),
+        ((6, 6, 6), TO_BT601, BT601),
         ((1, 1, 1), TO_SRGB, BT709),
         ((12, 13, 1), TO_P3, BT709),
         ((9, 14, 9), TO_BT2020, BT2020),

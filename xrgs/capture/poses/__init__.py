@@ -89,8 +89,8 @@ def _source(path: str) -> Path | list[Path]:
     if colmap.files(root):
         return root
     raise XrgsError(
-        "it must have a transforms.json, or cameras and images, and points3D where there are "
-        "points, all .bin or all .txt; COLMAP's folder is often called sparse/0"
+        "it must have a transforms.json, or cameras, images and points3D (which may be missing), "
+        "all .bin or all .txt; COLMAP's folder is often called sparse/0"
         f"{foreign.in_folder(root)}"
     )
 

@@ -245,7 +245,7 @@ def _viewmat(rows: object) -> NDArray[np.float64]:
         raise ValueError("transform_matrix must be 4 x 4 finite numbers")
     if len(matrix) == 4 and np.abs(matrix[3] - (0, 0, 0, 1)).max() > _MAX_LAST_ROW:
         raise ValueError(
-            "the last row of transform_matrix must be 0, 0, 0, 1; is it written column by column?"
+            "transform_matrix must be of rows, the last of them 0, 0, 0, 1; is it of columns?"
         )
     # Rounded digits make a rotation that is not quite one: the nearest rotation is taken. A scale
     # of the camera's own axes changes no projection.

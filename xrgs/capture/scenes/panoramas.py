@@ -65,24 +65,24 @@ def _projection(file: Path) -> str:
     try:
         if name := exif.read(file).projection:
             return f"left out as panoramas, by their metadata ({name})"
-        if is_of_all_directions(size(file), lambda: images.thumbnail(file, _SIDE)):
+        if is_of_all_directions(size(file), lambda side: images.thumbnail(file, side)):
             return "left out as panoramas of 360 degrees, by their shape and edges"
     except images.ImageError:
         pass
     return ""
 
 
-def is_of_all_directions(size: tuple[int, int], small: Callable[[], NDArray[np.uint8]]) -> bool:
+def is_of_all_directions(size: tuple[int, int], small: Callable[[int], NDArray[np.uint8]]) -> bool:
     """Tell by its content whether a picture shows all directions, 360 by 180 degrees.
 
     Args:
         size: Its width and height, px.
-        small: Returns it grey and square, [H, W]; called where it has the shape.
+        small: Returns it grey and square [S, S] for a side S; called where it has the shape.
     """
     width, height = size
     if not height or abs(width / height / _ASPECT - 1) > _ASPECT_TOLERANCE:
         return False
-    grey = small().astype(np.float64)
+    grey = small(_SIDE).astype(np.float64)
     steps = np.abs(np.diff(grey, axis=1)).mean(axis=0)
     variation = grey.std(axis=1)
     usual = np.median(variation)
