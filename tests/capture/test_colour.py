@@ -331,7 +331,8 @@ def to_linear_srgb(primaries: int) -> Floats:
 
     (matrix, white), (srgb, target) = to_xyz(primaries), to_xyz(1)
     scales = np.diag((BRADFORD @ target) / (BRADFORD @ white))
-    return np.linalg.inv(srgb) @ np.linalg.inv(BRADFORD) @ scales @ BRADFORD @ matrix
+    adapted: Floats = np.linalg.inv(srgb) @ np.linalg.inv(BRADFORD) @ scales @ BRADFORD @ matrix
+    return adapted
 
 
 #: The light of a value by H.273's numbers of curves (its table 3).
@@ -410,7 +411,7 @@ def test_numbers_that_are_not_known_are_refused(
 def test_full_and_narrow_range_are_the_same_picture(tmp_path: Path, suffix: str) -> None:
     """The two containers have YUV of either range, which their decoders read."""
     pillow_heif.register_heif_opener()
-    flags: list[dict[str, object]] = [{"full_range_flag": 1}, {"full_range_flag": 0}]
+    flags: list[dict[str, Any]] = [{"full_range_flag": 1}, {"full_range_flag": 0}]
     if suffix == ".avif":
         flags = [{"range": "full", "subsampling": "4:4:4"}, {"range": "limited"}]
     for i, flag in enumerate(flags):

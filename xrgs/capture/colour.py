@@ -283,13 +283,15 @@ def _by_encoding(rgb: NDArray[np.float32], encoding: Encoding) -> NDArray[np.flo
 
 def _linear(rgb: NDArray[np.float32], encoding: Encoding) -> NDArray[np.float32]:
     """Decode values in 0..1 by the curve of an encoding; white is 1."""
+    linear: NDArray[np.float32]
     if encoding.smpte == _H273_SMPTE_240M:
-        return np.where(rgb < 4 * 0.0228, rgb / 4, ((rgb + 0.1115) / 1.1115) ** (1 / 0.45))
-    if encoding.smpte == _H273_SMPTE_428:  # of cinemas, whose white is 48 of 52.37 cd/m²
-        return np.minimum(52.37 / 48 * rgb**2.6, 1)
-    if encoding.gamma is None:
-        return np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
-    linear: NDArray[np.float32] = rgb**encoding.gamma
+        linear = np.where(rgb < 4 * 0.0228, rgb / 4, ((rgb + 0.1115) / 1.1115) ** (1 / 0.45))
+    elif encoding.smpte == _H273_SMPTE_428:  # of cinemas, whose white is 48 of 52.37 cd/m²
+        linear = np.minimum(52.37 / 48 * rgb**2.6, 1)
+    elif encoding.gamma is None:
+        linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    else:
+        linear = rgb**encoding.gamma
     return linear
 
 
@@ -299,10 +301,10 @@ def _to_xyz(xy: Chromaticities) -> NDArray[np.float64]:
     columns = np.array([(x, y, 1 - x - y) for x, y in primaries]).T
     matrix = columns * np.linalg.solve(columns, _xyz(*white))
     cones, target = _BRADFORD @ _xyz(*white), _BRADFORD @ _xyz(*SRGB[:2])
-    adaptation: NDArray[np.float64] = np.linalg.solve(
-        _BRADFORD, (target / cones)[:, None] * _BRADFORD
+    adapted: NDArray[np.float64] = np.linalg.solve(
+        _BRADFORD, (target / cones)[:, None] * (_BRADFORD @ matrix)
     )
-    return adaptation @ matrix
+    return adapted
 
 
 def _xyz(x: float, y: float) -> NDArray[np.float64]:

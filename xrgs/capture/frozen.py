@@ -2,7 +2,8 @@
 
 The folder is named by the variant's id. `variant.json` (`Manifest`) lists the views and the hash
 of every other file that decides a number: `images/<split>/<view>.png`, the masks
-`images/<split>-masks/<view>.png` of the views that have one, and `points.npz`, the SfM points.
+`images/<split>-masks/<view>.png` of the views that have one, and `points.npz`, the SfM points and,
+where poses were given, the transform from their world.
 `report.json` says how SfM went, and `colmap.log` is COLMAP's log.
 """
 
@@ -99,8 +100,10 @@ def freeze(made: Variant, key: str, folder: Path, variants: Path, code: dict[str
         The variant, as it is read from its new place.
     """
     with atomic_writer(folder / POINTS, durable=False) as stream:
-        world = {} if np.array_equal(made.world, np.eye(4)) else {"world": made.world}
-        np.savez(stream, points=made.points, colors=made.colors, **world)
+        if np.array_equal(made.world, np.eye(4)):
+            np.savez(stream, points=made.points, colors=made.colors)
+        else:
+            np.savez(stream, points=made.points, colors=made.colors, world=made.world)
     write_json(folder / REPORT, made.report, durable=False)
     views = tuple(_entry(folder, view) for view in made.views)
     manifest = Manifest(

@@ -154,7 +154,7 @@ def register(
             break
     if best is None:
         raise RuntimeError("there is always a first attempt")
-    if best[0].apart:
+    if best[0].apart and conf.camera == "auto":
         found = run(replace(best[2], name="cameras_apart", apart=best[0].apart))
         if _rank(*found[:2]) >= _rank(*best[:2]) and _error(found[0]) < _error(best[0]):
             best = found

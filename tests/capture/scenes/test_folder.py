@@ -308,7 +308,11 @@ def test_images_that_are_not_read_are_named(
         ("a.zip", "an archive (.zip), not a folder; unpack it"),
         ("a.TAR", "an archive (.tar), not a folder; unpack it"),
         ("a.mp4", "a video, not a folder; scene=video takes its frames"),
-        ("a.xml", "not a folder; give the folder that the photographs are in"),
+        ("a.out", "a file of Bundler, not a folder; give the folder that the photographs are in"),
+        (
+            "a.xml",
+            "as Metashape's cameras are, not a folder; give the folder that the photographs are in",
+        ),
     ],
 )
 def test_a_file_in_place_of_the_folder_is_named(tmp_path: Path, name: str, what: str) -> None:

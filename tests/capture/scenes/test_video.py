@@ -12,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tests.capture.scene_confs import scene_conf
+from tests.capture.scenes.test_panoramas import sphere
 from xrgs.capture import images, scenes
 from xrgs.capture.images import ImageError
 from xrgs.capture.scenes import video
@@ -258,3 +259,32 @@ def test_sharpness_is_that_of_the_laplacian() -> None:
 
 def test_parts_are_equal_and_the_first_of_equals_is_taken() -> None:
     assert video.sharpest([1, 1, 1, 1, 1, 2, 0], 3) == [0, 2, 5]
+
+
+def write_streams(file: Path, *pictures: NDArray[np.uint8]) -> None:
+    """Write a video of four frames without loss, with a stream of each picture."""
+    with av.open(str(file), "w") as container:
+        streams = [container.add_stream("ffv1", rate=Fraction(10)) for _ in pictures]
+        for stream, picture in zip(streams, pictures, strict=True):
+            stream.height, stream.width = picture.shape[:2]
+            stream.pix_fmt = "yuv420p"
+        for stream, picture in zip(streams, pictures, strict=True):
+            for _ in range(4):
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+            container.mux(stream.encode(None))
+
+
+def test_the_first_of_several_streams_is_taken_and_said(tmp_path: Path) -> None:
+    write_streams(tmp_path / "a.mkv", textured(200, 9), textured(60, 9))
+    scene = scenes.resolve(conf(tmp_path / "a.mkv", 2), tmp_path)
+    assert scene.notes == ("the first of the 2 video streams of a.mkv is read, and no other",)
+    brightness = images.read(scene.files["frame_0000"])[50:].mean() * 255
+    assert brightness == pytest.approx(200, abs=6)
+    write_streams(tmp_path / "b.mkv", textured(90, 0))
+    assert scenes.resolve(conf(tmp_path / "b.mkv", 2), tmp_path).notes == ()
+
+
+def test_a_video_of_all_directions_is_refused(tmp_path: Path) -> None:
+    write_streams(tmp_path / "a.mkv", sphere(1, 64))
+    with pytest.raises(ImageError, match=r"a\.mkv: its frames show all directions, 360 degrees"):
+        scenes.resolve(conf(tmp_path / "a.mkv", 2), tmp_path)

@@ -17,7 +17,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from xrgs.capture.colmap import read_points
 from xrgs.capture.lens import MODELS, Lens, lens_of_model
 from xrgs.capture.poses.given import GivenPoses
 from xrgs.errors import XrgsError
@@ -125,6 +124,8 @@ def read(root: Path) -> GivenPoses:
 
 def _points(file: Path | None = None) -> _Points:
     """Read the points of a model; those of a .ply have no number, and are in no image."""
+    from xrgs.capture.colmap import read_points
+
     if file is not None and file.suffix == ".bin":
         return _binary_points(file)
     if file is not None and file.suffix == ".txt":

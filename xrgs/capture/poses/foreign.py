@@ -40,6 +40,11 @@ _KEYS = {
 }
 
 
+def kind(file: Path) -> str:
+    """Say what a file is by the end of its name; empty where it may be a transforms.json."""
+    return next((w for end, (w, _) in _ENDINGS.items() if file.name.lower().endswith(end)), "")
+
+
 def check_file(file: Path) -> None:
     """Refuse a file that is no .json.
 

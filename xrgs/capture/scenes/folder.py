@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING
 
 from xrgs.capture import images
 from xrgs.capture.masks import WORDS
+from xrgs.capture.poses import foreign
 from xrgs.capture.scenes.copies import SIZES, one_of_each_size, without_copies
 from xrgs.capture.scenes.made import is_mask, without_made
 from xrgs.capture.scenes.panoramas import without_panoramas
@@ -315,7 +316,8 @@ def _not_a_folder(file: Path) -> str:
         return f"an archive ({suffix}), not a folder; unpack it, and give the folder"
     if suffix in _VIDEOS:
         return "a video, not a folder; scene=video takes its frames"
-    return "not a folder; give the folder that the photographs are in"
+    what = f"{kind}, " if (kind := foreign.kind(file)) else ""
+    return f"{what}not a folder; give the folder that the photographs are in"
 
 
 def _rare(files: Sequence[Path]) -> list[str]:

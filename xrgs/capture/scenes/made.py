@@ -79,7 +79,8 @@ def _made_of_others(files: Sequence[Path]) -> set[Path]:
     made, extended = set(), defaultdict(list)
     for stem, group in named.items():
         plain = {_ADDED_BEFORE.sub("", stem), _ADDED_AFTER.sub("", stem)} - {stem}
-        if stem in names or plain & known.keys():
+        of_whole_name = stem in names and names[stem] not in group  # or it has no suffix
+        if of_whole_name or plain & known.keys():
             made |= {*group}
             continue
         for part, rest in _parts(stem):
