@@ -280,10 +280,9 @@ class _File(Protocol):
 class _PilFile:
     """A photograph that PIL opens; `deep` decodes the PNGs and HEIC files of more than 8 bits."""
 
-    def __init__(self, stream: BinaryIO, start: bytes, note: str = "") -> None:
+    def __init__(self, stream: BinaryIO, start: bytes, path: Path, note: str = "") -> None:
         self._stream, self.note = stream, note
-        suffix = Path(stream.name).suffix
-        self.image = image = Image.open(stream, formats=_formats(start, suffix))
+        self.image = image = Image.open(stream, formats=_formats(start, path.suffix))
         is_heif, is_png = image.format == "HEIF", image.format == "PNG"
         self._chunks, has_late_exif = _png_chunks(stream) if is_png else ({}, False)
         self.channels, self.bits = len(image.getbands()), int(image.info.get("bit_depth", 8))
@@ -415,16 +414,16 @@ class _DeepTiff:
         return _Samples(found.colours, found.alpha, found.note)
 
 
-def _file(stream: BinaryIO) -> _File:
+def _file(stream: BinaryIO, path: Path) -> _File:
     start = stream.read(16)
     stream.seek(0)
     if start[:4] not in _TIFF_MAGIC:
-        return _PilFile(stream, start)
+        return _PilFile(stream, start, path)
     tiff = deep.Tiff(stream)
     if tiff.is_deep:
         return _DeepTiff(stream, tiff)
     stream.seek(0)
-    return _PilFile(stream, start, tiff.note)
+    return _PilFile(stream, start, path, tiff.note)
 
 
 def _colour_box(stream: BinaryIO, is_avif: bool) -> bytes:
@@ -482,7 +481,7 @@ def header(path: Path) -> Header:
         ImageError: The file is not an image, or is larger than `MAX_PIXELS`.
     """
     with _stream(path) as stream:
-        return _header(_file(stream))
+        return _header(_file(stream, path))
 
 
 def _header(file: _File) -> Header:
@@ -524,7 +523,7 @@ def thumbnail(path: Path, side: int) -> NDArray[np.uint8]:
         ImageError: The file is unreadable or truncated.
     """
     with _stream(path) as stream:
-        file = _file(stream)
+        file = _file(stream, path)
         if isinstance(file, _PilFile) and file.bits <= 8:
             # JPEGs are decoded at down to an eighth of their size.
             file.image.draft("RGB", (16 * side, 16 * side))
@@ -550,7 +549,7 @@ def metadata(path: Path) -> tuple[Image.Exif, dict[int, Any], str]:
         ImageError: The file is not an image.
     """
     with _stream(path) as stream:
-        file, details = _file(stream), {}
+        file, details = _file(stream, path), {}
         with suppress(Exception):  # PIL raises nearly anything on damaged EXIF
             details = file.exif.get_ifd(_EXIF_DETAILS)
         return file.exif, details, file.xmp
@@ -565,7 +564,7 @@ def decode(path: Path) -> Picture:
             no known white.
     """
     with _stream(path) as stream:
-        file = _file(stream)
+        file = _file(stream, path)
         head, several = _header(file), file.frames > 1
         samples = file.load()
         encoding = None if file.profile else file.encoding()

@@ -13,7 +13,7 @@ which is the first guess of all of these, the last attempt is without it.
 
 Photographs that were cropped or zoomed may keep their EXIF, and share a camera with the others. The
 best reconstruction is tried for this: where views fit better with a camera of their own
-(`xrgs.capture.sfm.other_cameras`), the attempt `cameras_apart` gives them one.
+(`xrgs.capture.own_cameras`), the attempt `cameras_apart` gives them one.
 """
 
 from __future__ import annotations
@@ -156,7 +156,7 @@ def register(
         raise RuntimeError("there is always a first attempt")
     if best[0].apart and conf.camera == "auto":
         found = run(replace(best[2], name="cameras_apart", apart=best[0].apart))
-        if _rank(*found[:2]) >= _rank(*best[:2]) and _error(found[0]) < _error(best[0]):
+        if (*_rank(*found[:2]), -_error(found[0])) > (*_rank(*best[:2]), -_error(best[0])):
             best = found
     model, reason, attempt = best
     notes = [*model.report.get("notes", ()), *_notes(attempt, photos)]

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import tempfile
 import zlib  # noqa: F401  pycolmap 4.2.1 corrupts the heap where it is imported before zlib
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,6 +19,7 @@ from numpy.typing import NDArray
 from xrgs.capture import images
 from xrgs.capture.lens import Lens, lens_of_model
 from xrgs.capture.masks import MASKS
+from xrgs.capture.own_cameras import other_cameras
 from xrgs.runtime.machine import usable_cores
 from xrgs.runtime.progress import ProgressBar
 from xrgs.runtime.text import listed
@@ -39,11 +39,6 @@ _TWO_VIEW_ANGLE = 0.2
 #: The inliers of the first pair over the inliers of a later view: COLMAP's defaults of
 #: `init_min_num_inliers` and `abs_pose_min_num_inliers`.
 _FIRST_PAIR_RATIO = 100 / 30
-#: Where images with one camera are tried with cameras of their own: the fewest images, the most
-#: iterations, the share of the reprojection error that must remain at most, and the ratio of focal
-#: lengths up to which they are one. Our choice: of fern's 20 photographs each has a focal length
-#: within 0.7 % of the others' then, and the error 0.998 of what it was.
-_LEAST_SHARING, _OWN_ITERATIONS, _BETTER, _SAME_FOCAL = 3, 30, 0.97, 1.05
 #: The entries of K that are the parameters of COLMAP's PINHOLE camera.
 _PINHOLE_ENTRIES = ((0, 0), (1, 1), (0, 2), (1, 2))
 
@@ -87,7 +82,7 @@ class Reconstruction:
     """The rigid transform [4, 4] from the world of given poses to this one."""
     apart: Mapping[int, int] = field(default_factory=dict)
     """The images that fit better with another camera than the one that they share, as
-    `other_cameras` numbers them."""
+    `xrgs.capture.own_cameras` numbers them."""
 
 
 def features_per_image(images: int, configured: int) -> int:
@@ -219,85 +214,6 @@ def _find_matches(
         _extract(sfm_images, folder, database, max_features, octave)
         _match(sfm_images, database, work, conf.seed)
     return {"first_octave": octave, "max_num_features": max_features}
-
-
-def other_cameras(model: Any, sfm_images: Sequence[SfmImage]) -> dict[int, int]:
-    """Find the images that fit better with another camera than the one that they share.
-
-    Each image gets a camera of its own, and focal lengths, poses and points are refined together.
-    Nothing is found unless the reprojection error falls by 3 %, and the focal lengths of some are
-    then 5 % from those of the others with their camera.
-
-    Args:
-        model: pycolmap's `Reconstruction`; it stays as it is.
-        sfm_images: The images.
-
-    Returns:
-        A number by the index of each such image; images of one number have one focal length.
-    """
-    sharing = Counter(image.camera for image in sfm_images if image.K is None)
-    shared = {i.file: n for n, i in enumerate(sfm_images) if sharing[i.camera] >= _LEAST_SHARING}
-    if not any(image.has_pose and image.name in shared for image in model.images.values()):
-        return {}
-    own = _with_own_cameras(model)
-    if (
-        not own.compute_mean_reprojection_error()
-        < _BETTER * model.compute_mean_reprojection_error()
-    ):
-        return {}
-    focals: dict[str, dict[int, float]] = {}
-    for image in own.images.values():
-        if image.name in shared:
-            index = shared[image.name]
-            focal = own.cameras[image.camera_id].mean_focal_length()
-            focals.setdefault(sfm_images[index].camera, {})[index] = focal
-    apart: dict[int, int] = {}
-    for of_camera in focals.values():
-        groups = groups_of_focals(of_camera)
-        usual = max(groups, key=len)
-        for number, group in enumerate((g for g in groups if g is not usual), len(apart) + 1):
-            apart |= dict.fromkeys(group, number)
-    return apart
-
-
-def groups_of_focals(focals: Mapping[int, float]) -> list[list[int]]:
-    """Group images by focal length, where a gap of 5 % lies between two groups."""
-    groups: list[list[int]] = []
-    before = 0.0
-    for index, focal in sorted(focals.items(), key=lambda item: item[1]):
-        if before <= 0 or focal > _SAME_FOCAL * before:
-            groups.append([])
-        groups[-1].append(index)
-        before = focal
-    return groups
-
-
-def _with_own_cameras(model: Any) -> Any:
-    """Copy a model, give each image a camera of its own, and refine all but the distortion."""
-    own = pycolmap.Reconstruction()
-    for image in model.images.values():
-        if not image.has_pose:
-            continue
-        camera = pycolmap.Camera(model.cameras[image.camera_id].todict())
-        camera.camera_id = image.image_id
-        own.add_camera_with_trivial_rig(camera)
-        points = pycolmap.Point2DList([pycolmap.Point2D(point.xy) for point in image.points2D])
-        copy = pycolmap.Image(
-            name=image.name, points2D=points, camera_id=image.image_id, image_id=image.image_id
-        )
-        own.add_image_with_trivial_frame(copy, image.cam_from_world())
-    for point in model.points3D.values():
-        own.add_point3D(point.xyz, point.track, point.color)
-    options = pycolmap.BundleAdjustmentOptions(refine_extra_params=False, print_summary=False)
-    options.ceres.solver_options.num_threads = 1
-    options.ceres.solver_options.max_num_iterations = _OWN_ITERATIONS
-    config = pycolmap.BundleAdjustmentConfig()
-    for number in own.images:
-        config.add_image(number)
-    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    pycolmap.create_default_bundle_adjuster(options, config, own).solve()
-    own.update_point_3d_errors()
-    return own
 
 
 def bogus_cameras(model: Any, sfm_images: Sequence[SfmImage]) -> dict[int, str]:

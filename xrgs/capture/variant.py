@@ -46,6 +46,7 @@ CORE = (
     "capture/lens.py",
     "capture/masks.py",
     "capture/mixing.py",
+    "capture/own_cameras.py",
     "capture/photographs.py",
     "capture/registration.py",
     "capture/sampling.py",

@@ -21,7 +21,8 @@ def texture(seed: int, size: tuple[int, int]) -> NDArray[np.uint8]:
     noise = np.random.default_rng(seed).random((size[1], size[0], 3))
     smooth = gaussian_filter(noise, (size[1] / 20, size[1] / 20, 0))
     low, high = smooth.min(), smooth.max()
-    return ((smooth - low) / (high - low) * 255).astype(np.uint8)
+    picture: NDArray[np.uint8] = ((smooth - low) / (high - low) * 255).astype(np.uint8)
+    return picture
 
 
 def sphere(seed: int, height: int = 128) -> NDArray[np.uint8]:
@@ -34,7 +35,8 @@ def sphere(seed: int, height: int = 128) -> NDArray[np.uint8]:
     centres = rng.normal(size=(60, 3))
     centres /= np.linalg.norm(centres, axis=1, keepdims=True)
     bumps = np.exp(20 * (rays @ centres.T - 1)) @ rng.random((60, 3))
-    return (bumps / bumps.max() * 255).astype(np.uint8)
+    picture: NDArray[np.uint8] = (bumps / bumps.max() * 255).astype(np.uint8)
+    return picture
 
 
 def test_pictures_of_all_directions_are_left_out_without_metadata(tmp_path: Path) -> None:
@@ -61,6 +63,19 @@ def test_photographs_that_are_twice_as_wide_as_high_are_kept(tmp_path: Path) -> 
         Image.fromarray(texture(i, (200, 100))).save(tmp_path / f"a{i}.jpg")
     found = folder.look(str(tmp_path), 0)
     assert (len(found.files), found.notes) == (8, ())
+
+
+@pytest.mark.parametrize("background", ["plain", "gradient", "noise"])
+def test_objects_before_a_plain_background_are_kept(tmp_path: Path, background: str) -> None:
+    """It goes on at the other side, and its top and bottom rows vary little."""
+    rows = np.linspace(250, 120, 100) if background == "gradient" else np.full(100, 240.0)
+    for i in range(8):
+        picture = np.repeat(np.repeat(rows[:, None, None], 200, axis=1), 3, axis=2)
+        if background == "noise":
+            picture = picture + np.random.default_rng(i).normal(0, 2, picture.shape)
+        picture[30:70, 20 + 10 * i : 100 + 10 * i] = texture(i, (80, 40))
+        Image.fromarray(picture.astype(np.uint8)).save(tmp_path / f"a{i}.png")
+    assert len(folder.look(str(tmp_path), 0).files) == 8
 
 
 @pytest.mark.parametrize("size", [(160, 120), (200, 100), (150, 150)])

@@ -84,7 +84,7 @@ def patches(to_primaries: list[list[float]], luma: tuple[float, float]) -> NDArr
     linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
     linear = linear @ np.transpose(to_primaries)
     red, green, blue = np.where(
-        linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055
+        linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0) ** (1 / 2.4) - 0.055
     ).T
     of_red, of_blue = luma
     y = of_red * red + (1 - of_red - of_blue) * green + of_blue * blue

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,7 +17,6 @@ from xrgs.safeio.sanitize import counted
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
-    from pathlib import Path
 
 #: What a name has before or after the name of the photograph that an image was made of.
 _ADDED = rf"(?:{WORDS}|depth|disparity|normals?|thumb|thumbnail)"
@@ -76,7 +76,8 @@ def _made_of_others(files: Sequence[Path]) -> set[Path]:
         named[file.stem.casefold()].append(file)
     names = {file.name.casefold(): file for file in files}
     known = names | {stem: group[0] for stem, group in named.items()}
-    made, extended = set(), defaultdict(list)
+    made = set[Path]()
+    extended: dict[tuple[Path, str], list[tuple[Path, Path]]] = defaultdict(list)
     for stem, group in named.items():
         plain = {_ADDED_BEFORE.sub("", stem), _ADDED_AFTER.sub("", stem)} - {stem}
         of_whole_name = stem in names and names[stem] not in group  # or it has no suffix

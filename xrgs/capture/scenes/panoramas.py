@@ -30,6 +30,8 @@ _SIDE = 128
 #: times what neighbouring columns do. The rows at the top and the bottom, which are a point each,
 #: vary by no more than this share of the others. Of 240 ordinary photographs none had both.
 _MOST_STEP, _MOST_VARIATION = 1.5, 0.4
+#: The columns at an edge, and how much they differ at least, as a share of what others do.
+_NEAR_EDGE, _LEAST_STEP = 8, 0.4
 
 
 def without_panoramas(files: Sequence[Path], folder: Path) -> tuple[list[Path], list[str]]:
@@ -87,5 +89,8 @@ def is_of_all_directions(size: tuple[int, int], small: Callable[[int], NDArray[n
     variation = grey.std(axis=1)
     usual = np.median(variation)
     around = np.abs(grey[:, 0] - grey[:, -1]).mean() <= _MOST_STEP * np.median(steps)
+    # A plain background goes on at the other side too, but has nothing to tell it by.
+    edges = min(steps[:_NEAR_EDGE].mean(), steps[-_NEAR_EDGE:].mean())
+    has_edges = edges >= _LEAST_STEP * np.median(steps)
     poles = max(variation[0], variation[-1]) <= _MOST_VARIATION * usual
-    return bool(usual > 0 and around and poles)
+    return bool(usual > 0 and around and has_edges and poles)
