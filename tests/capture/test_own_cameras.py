@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import zlib  # noqa: F401  pycolmap corrupts the heap where it is imported before zlib
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pycolmap
 import pytest
 
-from xrgs.capture import own_cameras, sfm
+from xrgs.capture import own_cameras
 
 
-def cropped(factor: float, odd: Sequence[int]) -> tuple[Any, list[sfm.SfmImage]]:
+def cropped(factor: float, odd: Sequence[int]) -> tuple[Any, dict[str, tuple[int, str]]]:
     """A model of ten views with one camera, of which some were enlarged about their centre."""
     options = pycolmap.SyntheticDatasetOptions()
     options.num_rigs, options.num_frames_per_rig, options.num_points3D = 1, 10, 300
@@ -34,7 +33,7 @@ def cropped(factor: float, odd: Sequence[int]) -> tuple[Any, list[sfm.SfmImage]]
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     pycolmap.create_default_bundle_adjuster(adjusted, config, model).solve()
     model.update_point_3d_errors()
-    return model, [sfm.SfmImage(view.name, view.name, "one") for view in views]
+    return model, {view.name: (i, "one") for i, view in enumerate(views)}
 
 
 @pytest.mark.parametrize("factor", [1 / 0.5, 1 / 0.7, 1.2, 0.8])
@@ -58,9 +57,8 @@ def test_views_of_one_camera_share_it() -> None:
 
 def test_cameras_that_are_known_or_apart_already_are_not_tried() -> None:
     model, given = cropped(1 / 0.7, (2, 5, 6))
-    known = [replace(image, K=np.eye(3)) for image in given]
-    assert own_cameras.other_cameras(model, known) == {}
-    own = [replace(image, camera=image.name) for image in given]
+    assert own_cameras.other_cameras(model, {}) == {}
+    own = {name: (i, name) for name, (i, _) in given.items()}
     assert own_cameras.other_cameras(model, own) == {}
 
 

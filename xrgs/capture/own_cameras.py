@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import zlib  # noqa: F401  pycolmap 4.2.1 corrupts the heap where it is imported before zlib
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from typing import Any
 
 import pycolmap
-
-if TYPE_CHECKING:
-    from xrgs.capture.sfm import SfmImage
 
 #: Where images with one camera are tried with cameras of their own: the fewest images, the most
 #: iterations, the share of the reprojection error that must remain at most, and the ratio of focal
@@ -19,7 +16,7 @@ if TYPE_CHECKING:
 _LEAST_SHARING, _OWN_ITERATIONS, _BETTER, _SAME_FOCAL = 3, 30, 0.97, 1.05
 
 
-def other_cameras(model: Any, sfm_images: Sequence[SfmImage]) -> dict[int, int]:
+def other_cameras(model: Any, cameras: Mapping[str, tuple[int, str]]) -> dict[int, int]:
     """Find the images that fit better with another camera than the one that they share.
 
     Each image gets a camera of its own, and focal lengths, poses and points are refined together.
@@ -28,13 +25,14 @@ def other_cameras(model: Any, sfm_images: Sequence[SfmImage]) -> dict[int, int]:
 
     Args:
         model: pycolmap's `Reconstruction`; it stays as it is.
-        sfm_images: The images.
+        cameras: The index of each image and the name of its camera, by the image's name in the
+            model; images with one name share the camera. Others are left alone.
 
     Returns:
         A number by the index of each such image; images of one number have one focal length.
     """
-    sharing = Counter(image.camera for image in sfm_images if image.K is None)
-    shared = {i.file: n for n, i in enumerate(sfm_images) if sharing[i.camera] >= _LEAST_SHARING}
+    sharing = Counter(camera for _, camera in cameras.values())
+    shared = {name for name, (_, camera) in cameras.items() if sharing[camera] >= _LEAST_SHARING}
     if not any(image.has_pose and image.name in shared for image in model.images.values()):
         return {}
     own = _with_own_cameras(model)
@@ -46,9 +44,9 @@ def other_cameras(model: Any, sfm_images: Sequence[SfmImage]) -> dict[int, int]:
     focals: dict[str, dict[int, float]] = {}
     for image in own.images.values():
         if image.name in shared:
-            index = shared[image.name]
+            index, camera = cameras[image.name]
             focal = own.cameras[image.camera_id].mean_focal_length()
-            focals.setdefault(sfm_images[index].camera, {})[index] = focal
+            focals.setdefault(camera, {})[index] = focal
     apart: dict[int, int] = {}
     for of_camera in focals.values():
         groups = groups_of_focals(of_camera)

@@ -153,7 +153,8 @@ def reconstruct(
     bogus = bogus_cameras(largest, sfm_images)
     report["notes"] = list(_notes(sfm_images, bogus))
     index = {image.file: i for i, image in enumerate(sfm_images) if i not in bogus}
-    apart = other_cameras(largest, sfm_images)
+    refined = {s.file: (i, s.camera) for i, s in enumerate(sfm_images) if s.K is None}
+    apart = other_cameras(largest, refined)
     return replace(to_numpy(largest, index, report), apart=apart)
 
 

@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from xrgs.capture import images
+from xrgs.capture import foreign, images
 from xrgs.capture.lens import Lens, quarter_turn
-from xrgs.capture.poses import checks, colmap, foreign, transforms, world
+from xrgs.capture.poses import checks, colmap, transforms, world
 from xrgs.capture.poses.given import MIN_POINTS
 from xrgs.errors import UnreadableError, XrgsError
 from xrgs.runtime.text import listed

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from xrgs.capture import foreign
 from xrgs.capture.lens import MODELS, Lens, lens_of_model
-from xrgs.capture.poses import foreign
 from xrgs.capture.poses.given import GivenPoses
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.runtime.text import listed

@@ -20,9 +20,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from xrgs.capture import images
+from xrgs.capture import foreign, images
 from xrgs.capture.masks import WORDS
-from xrgs.capture.poses import foreign
 from xrgs.capture.scenes.copies import SIZES, one_of_each_size, without_copies
 from xrgs.capture.scenes.made import is_mask, without_made
 from xrgs.capture.scenes.panoramas import without_panoramas
