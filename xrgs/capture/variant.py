@@ -59,6 +59,7 @@ CORE = (
 #: The source files that read given poses.
 POSES = (
     "capture/colmap.py",
+    "capture/foreign.py",
     "capture/poses/__init__.py",
     "capture/poses/checks.py",
     "capture/poses/colmap.py",
