@@ -125,7 +125,7 @@ def with_exif(photos: PhotoCollection, focal: float | None) -> PhotoCollection:
     return replace(photos, all=tuple(known))
 
 
-def test_the_last_attempt_is_without_the_focal_length_of_exif(
+def test_an_attempt_is_without_the_focal_length_of_exif(
     photos: PhotoCollection, sfm_conf: SfmConf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     given: list[list[sfm.SfmImage]] = []
@@ -142,7 +142,7 @@ def test_the_last_attempt_is_without_the_focal_length_of_exif(
         tmp_path,
         lambda model: "" if len(model.viewmats) == 2 else "too few",
     )
-    assert [a["attempt"] for a in done.attempts][-2:] == ["native", "without_exif"]
+    assert [a["attempt"] for a in done.attempts] == ["configured", "relaxed", "without_exif"]
     assert all(image.focal for images_of in given[:-1] for image in images_of)
     assert [image.focal for image in given[-1]] == [None, None]
     assert done.refused == ""

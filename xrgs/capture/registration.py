@@ -9,7 +9,7 @@ a camera of its size.
 The first attempt, `configured`, has the settings of `variant.sfm`. With `sfm.fallbacks`, the
 attempts of `FALLBACKS` follow in their order until a reconstruction is accepted. The first of them
 also follows where a reconstruction is accepted that lacks views. Where EXIF gives a focal length,
-which is the first guess of all of these, the last attempt is without it.
+which is the first guess of the others, an attempt without it comes second of them.
 
 Photographs that were cropped or zoomed may keep their EXIF, and share a camera with the others. The
 best reconstruction is tried for this: where views fit better with a camera of their own
@@ -217,8 +217,8 @@ def sfm_attempts(
         if following is not None:
             attempt = following
             yield attempt
-    if conf.fallbacks and any_focal:
-        yield Attempt("without_exif", conf, uses_exif=False)
+        if fallback is FALLBACKS[0] and any_focal:
+            yield Attempt("without_exif", conf, uses_exif=False)
 
 
 def _features_of(attempt: Attempt) -> tuple[object, ...]:
