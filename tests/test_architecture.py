@@ -42,7 +42,7 @@ LAYER = {name: number for number, name in enumerate(FLOW)}
 ONLY_IN = {
     "hydra": ("composing", "sweep", "cli"),
     "omegaconf": ("composing", "sweep", "cli"),
-    "pycolmap": ("capture/colmap", "capture/lens", "capture/sfm"),
+    "pycolmap": ("capture/colmap", "capture/lens", "capture/own_cameras", "capture/sfm"),
     "matplotlib": ("report", "bench"),
     "pandas": ("experiment", "report", "bench"),
     "kornia": ("evaluation/metrics/ssim",),

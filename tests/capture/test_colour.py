@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import struct
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -296,6 +298,164 @@ def test_hdr_is_refused_by_name(tmp_path: Path, transfer: int, name: str) -> Non
         ImageError, match=rf"a\.png: its brightness is HDR \({name}\); save it as SDR"
     ):
         images.decode(tmp_path / "a.png")
+
+
+#: The chromaticities of red, green, blue and white by H.273's numbers (its table 2).
+H273: dict[int, list[tuple[float, float]]] = {
+    1: [(0.64, 0.33), (0.3, 0.6), (0.15, 0.06), (0.3127, 0.329)],
+    4: [(0.67, 0.33), (0.21, 0.71), (0.14, 0.08), (0.31, 0.316)],
+    5: [(0.64, 0.33), (0.29, 0.6), (0.15, 0.06), (0.3127, 0.329)],
+    6: [(0.63, 0.34), (0.31, 0.595), (0.155, 0.07), (0.3127, 0.329)],
+    7: [(0.63, 0.34), (0.31, 0.595), (0.155, 0.07), (0.3127, 0.329)],
+    8: [(0.681, 0.319), (0.243, 0.692), (0.145, 0.049), (0.31, 0.316)],
+    9: [(0.708, 0.292), (0.17, 0.797), (0.131, 0.046), (0.3127, 0.329)],
+    10: [(1, 0), (0, 1), (0, 0), (1 / 3, 1 / 3)],
+    11: [(0.68, 0.32), (0.265, 0.69), (0.15, 0.06), (0.314, 0.351)],
+    12: [(0.68, 0.32), (0.265, 0.69), (0.15, 0.06), (0.3127, 0.329)],
+    22: [(0.63, 0.34), (0.295, 0.605), (0.155, 0.077), (0.3127, 0.329)],
+}
+#: The Bradford matrix [lam1985], as in ICC's specification (annex E).
+BRADFORD = np.array(
+    [[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]]
+)
+
+
+def to_linear_srgb(primaries: int) -> Floats:
+    """The matrix [3, 3] from linear RGB to linear sRGB: RGB of 1 is white in both."""
+
+    def to_xyz(number: int) -> tuple[Floats, Floats]:
+        *colours, white = ((x, y, 1 - x - y) for x, y in H273[number])
+        xyz = np.array(white) / white[1]
+        matrix = np.array(colours).T
+        return matrix @ np.diag(np.linalg.inv(matrix) @ xyz), xyz
+
+    (matrix, white), (srgb, target) = to_xyz(primaries), to_xyz(1)
+    scales = np.diag((BRADFORD @ target) / (BRADFORD @ white))
+    adapted: Floats = np.linalg.inv(srgb) @ np.linalg.inv(BRADFORD) @ scales @ BRADFORD @ matrix
+    return adapted
+
+
+#: The light of a value by H.273's numbers of curves (its table 3).
+CURVES: dict[int, Callable[[Floats], Floats]] = {
+    4: lambda v: v**2.2,
+    5: lambda v: v**2.8,
+    7: lambda v: np.where(v < 0.0912, v / 4, ((v + 0.1115) / 1.1115) ** (1 / 0.45)),
+    8: lambda v: v,
+    13: decoded,
+    17: lambda v: np.minimum(52.37 / 48 * v**2.6, 1),
+}
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+@pytest.mark.parametrize("primaries", H273)
+@pytest.mark.parametrize("transfer", CURVES)
+def test_the_numbers_of_cicp_are_converted(
+    tmp_path: Path, bits: int, primaries: int, transfer: int
+) -> None:
+    most = 255 if bits == 8 else 65535
+    samples = np.round(smooth() / 255 * most)
+    chunk = b"cICP", bytes([primaries, transfer, 0, 1])
+    (tmp_path / "a.png").write_bytes(png(samples, chunk, bits=bits))
+    light = CURVES[transfer](samples / most) @ to_linear_srgb(primaries).T
+    truth = encoded(np.clip(light, 0, 1))
+    assert np.abs(images.decode(tmp_path / "a.png").pixels - truth).max() < 0.1 / 255
+
+
+@pytest.mark.parametrize("transfer", [1, 6, 14, 15, 2])
+def test_curves_of_cameras_are_shown_as_srgbs(tmp_path: Path, transfer: int) -> None:
+    chunk = b"cICP", bytes([1, transfer, 0, 1])
+    (tmp_path / "a.png").write_bytes(png(smooth(), chunk, bits=8))
+    assert np.array_equal(images.decode(tmp_path / "a.png").pixels * 255, np.float32(smooth()))
+
+
+@pytest.mark.parametrize(("bits", "black", "white"), [(8, 16, 235), (16, 16 * 256, 235 * 256)])
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_values_of_narrow_range_are_stretched(
+    tmp_path: Path, bits: int, black: int, white: int, channels: int
+) -> None:
+    """BT.709 and BT.2020: black is at 16 and white at 235 of 8 bits, times 256 of 16 bits."""
+    truth = np.linspace(0, 1, 12).reshape(3, 4, 1)
+    values = np.round(black + truth * (white - black))
+    samples = np.repeat(values, channels, axis=2)
+    if channels == 4:
+        samples[..., 3] = 255 if bits == 8 else 65535
+    samples[0, 0, 0], samples[-1, -1, 0] = 0, 255 if bits == 8 else 65535  # foot- and headroom
+    (tmp_path / "a.png").write_bytes(png(samples, (b"cICP", bytes([1, 13, 0, 0])), bits=bits))
+    picture = images.decode(tmp_path / "a.png")
+    assert picture.alpha is None
+    assert picture.notes == ("converted from narrow-range sRGB to sRGB",)
+    found, step = picture.pixels.reshape(-1, 3), 0.5 / (white - black) + 1e-6
+    assert np.abs(found[1:-1] - truth.reshape(-1, 1)[1:-1]).max() <= step
+    assert found[0, 0] == 0
+    assert found[-1, 0] == pytest.approx(1, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "why"),
+    [
+        ((1, 9, 0, 1), "its brightness is logarithmic brightness"),
+        ((1, 19, 0, 1), "its curve is number 19 of H.273"),
+        ((13, 13, 0, 1), "its primaries are number 13 of H.273"),
+        ((1, 13, 1, 1), "its cICP names a matrix"),
+    ],
+)
+def test_numbers_that_are_not_known_are_refused(
+    tmp_path: Path, numbers: tuple[int, ...], why: str
+) -> None:
+    (tmp_path / "a.png").write_bytes(png(smooth(), (b"cICP", bytes(numbers)), bits=8))
+    with pytest.raises(ImageError, match=rf"a\.png: {why}"):
+        images.decode(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("suffix", [".heic", ".avif"])
+def test_full_and_narrow_range_are_the_same_picture(tmp_path: Path, suffix: str) -> None:
+    """The two containers have YUV of either range, which their decoders read."""
+    pillow_heif.register_heif_opener()
+    flags: list[dict[str, Any]] = [{"full_range_flag": 1}, {"full_range_flag": 0}]
+    if suffix == ".avif":
+        flags = [{"range": "full", "subsampling": "4:4:4"}, {"range": "limited"}]
+    for i, flag in enumerate(flags):
+        more = {"chroma": 444} | flag if suffix == ".heic" else flag
+        picture = Image.fromarray(np.full((64, 64, 3), (235, 128, 16), np.uint8))
+        picture.save(tmp_path / f"{i}{suffix}", quality=100, **more)
+        pixels = images.decode(tmp_path / f"{i}{suffix}").pixels[32, 32] * 255
+        assert np.abs(pixels - (235, 128, 16)).max() <= 3
+
+
+@pytest.mark.parametrize(("primaries", "transfer"), [(12, 13), (1, 5), (9, 16)])
+def test_avif_names_its_colours_by_number(tmp_path: Path, primaries: int, transfer: int) -> None:
+    Image.fromarray(smooth()).save(tmp_path / "a.avif", quality=100, subsampling="4:4:4")
+    plain = images.decode(tmp_path / "a.avif").pixels
+    content = bytearray((tmp_path / "a.avif").read_bytes())
+    at = content.index(b"colrnclx") + 8
+    content[at : at + 4] = struct.pack(">HH", primaries, transfer)
+    (tmp_path / "a.avif").write_bytes(content)
+    if transfer == 16:
+        with pytest.raises(ImageError, match=r"a\.avif: its brightness is HDR"):
+            images.decode(tmp_path / "a.avif")
+        return
+    light = CURVES[transfer](plain.astype(np.float64)) @ to_linear_srgb(primaries).T
+    found = images.decode(tmp_path / "a.avif").pixels
+    assert np.abs(found - encoded(np.clip(light, 0, 1))).max() < 0.1 / 255
+
+
+def test_the_profile_of_a_jpeg_2000_is_applied(tmp_path: Path) -> None:
+    """Pillow does not read it; the box of colours has method 2 and the profile."""
+    Image.fromarray(smooth()).save(tmp_path / "a.jp2", irreversible=False)
+    plain = images.decode(tmp_path / "a.jp2").pixels
+    assert np.array_equal(plain * 255, np.float32(smooth()))
+    content = (tmp_path / "a.jp2").read_bytes()
+    at = content.index(b"colr") - 4
+    icc = profile("P3", 2.2, DISPLAY_P3)
+    box = struct.pack(">I", 11 + len(icc)) + b"colr\2\0\0" + icc
+    header = content.index(b"jp2h") - 4
+    length = int.from_bytes(content[header : header + 4], "big") - 15 + len(box)
+    made = content[:header] + struct.pack(">I", length) + content[header + 4 : at] + box
+    (tmp_path / "a.jp2").write_bytes(made + content[at + 15 :])
+    Image.fromarray(smooth()).save(tmp_path / "b.png", icc_profile=icc)
+    found = images.decode(tmp_path / "a.jp2")
+    assert np.array_equal(found.pixels, images.decode(tmp_path / "b.png").pixels)
+    assert found.notes == ("converted from P3 to sRGB",)
 
 
 @pytest.mark.parametrize(

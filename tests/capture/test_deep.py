@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from tests.capture.made_files import SHORT, png, with_entry
-from xrgs.capture import images
+from xrgs.capture import exif, images
 from xrgs.capture.images import ImageError
 
 #: An image whose first value is white, so that its depth is plain.
@@ -296,7 +296,7 @@ def test_the_camera_of_a_tiff_of_16_bits_is_read(tmp_path: Path) -> None:
         photometric="rgb",
         extratags=[(0x010F, 2, 0, "Maker", True), (0x0110, 2, 0, "X 100", True)],
     )
-    assert images.exif_camera(tmp_path / "a.tif") == "Maker/X 100"
+    assert exif.read(tmp_path / "a.tif").camera == "Maker/X 100"
     with_tag = with_entry((tmp_path / "a.tif").read_bytes(), SHORT, 1, b"\6\0")
     (tmp_path / "a.tif").write_bytes(with_tag)
     assert images.header(tmp_path / "a.tif").orientation == 6

@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from tests.capture.made_files import DISPLAY_P3, SRGB, png, profile
-from xrgs.capture import images
+from xrgs.capture import exif, images
 from xrgs.capture.images import ImageError
 from xrgs.errors import UnreadableError
 
@@ -69,7 +69,7 @@ PHOTOGRAPHS = {kind: photograph(kind) for kind in ("PNG", "JPEG", "TIFF", "WEBP"
 def test_a_damaged_photograph_is_read_or_refused(tmp_path: Path, kind: str, change: Any) -> None:
     file = tmp_path / "a.png"
     file.write_bytes(changed(PHOTOGRAPHS[kind], change))
-    for reader in (images.size, images.exif_camera, images.read, images.read_png):
+    for reader in (images.size, exif.read, images.read, images.read_png):
         try:
             reader(file)
         except ImageError as error:

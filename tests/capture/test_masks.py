@@ -428,7 +428,9 @@ def test_sfm_finds_no_features_outside_a_mask(tmp_path: Path, sfm_conf: SfmConf)
     for i, image in enumerate(smooth):
         images.save(tmp_path / "x" / photos.file("sfm", i), image)
     photos.save_mask("sfm", 0, np.kron(USED, np.ones((8, 8), np.bool_)))
-    given_images = registration.sfm_images(photos, (), replace(sfm_conf, lr_images="native"))
+    given_images = registration.sfm_images(
+        photos, (), registration.Attempt("native", replace(sfm_conf, lr_images="native"))
+    )
     assert [image.masked for image in given_images] == [True, False]
     sfm.reconstruct(given_images, tmp_path / "x", tmp_path, sfm_conf)
     with pycolmap.Database.open(tmp_path / "database.db") as database:

@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 
 from tests.capture.made_files import DISPLAY_P3, profile
+from xrgs.capture import exif as exif_of
 from xrgs.capture import images
 from xrgs.capture.photographs import (
     assign_cameras,
@@ -302,4 +303,4 @@ def test_a_camera_with_damaged_exif_is_one_without(
 ) -> None:
     file = write_photograph(tmp_path / "a.jpg", model="X")
     monkeypatch.setattr(Image.Exif, "get_ifd", Mock(side_effect=SyntaxError("damaged")))
-    assert images.exif_camera(file) == "Maker/X"
+    assert exif_of.read(file).camera == "Maker/X"

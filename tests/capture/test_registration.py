@@ -30,6 +30,10 @@ def photos(configured: Make, stereo_scene: SceneConf, tmp_path: Path) -> PhotoCo
     return made
 
 
+def attempt(conf: SfmConf) -> registration.Attempt:
+    return registration.Attempt("configured", conf)
+
+
 def registered(views: int, points: int = 0) -> Reconstruction:
     """A reconstruction with so many views, as far as `register` reads it."""
     poses = {i: np.eye(4) for i in range(views)}
@@ -56,7 +60,7 @@ def test_attempts_follow_until_one_is_accepted(
     assert [a["min_inliers"] for a in done.attempts] == [30, 15, 15, 15]
     assert done.attempts[0]["registered"] == 2
     assert done.attempts[0]["seconds"] > 0
-    assert done.model.report["init_min_tri_angle"] == done.conf.init_min_tri_angle == 1
+    assert done.model.report["init_min_tri_angle"] == done.attempt.conf.init_min_tri_angle == 1
     for name in ("configured", "finer"):
         assert len(list((tmp_path / f"sfm-{name}").glob("models-*"))) == 2
     assert not (tmp_path / "sfm-relaxed").exists()
@@ -92,7 +96,7 @@ def test_an_accepted_attempt_that_lacks_a_view_is_followed_by_one_more(
     assert done.refused == ""
     better = second == 2 and not refused
     assert len(done.model.viewmats) == (2 if better else 1)
-    assert done.conf.min_inliers == (15 if better else 30)
+    assert done.attempt.conf.min_inliers == (15 if better else 30)
 
 
 @pytest.mark.parametrize("fallbacks", [True, False])
@@ -114,6 +118,81 @@ def test_where_all_are_refused_the_one_with_most_views_is_returned(
     )
     assert [a["registered"] for a in done.attempts] == ([0, 2, 1, 0, 2] if fallbacks else [0])
     assert done.refused == ("2 are too few" if fallbacks else "0 are too few")
+
+
+def with_exif(photos: PhotoCollection, focal: float | None) -> PhotoCollection:
+    known = (replace(photo, K=None, focal_35mm=focal) for photo in photos.all)
+    return replace(photos, all=tuple(known))
+
+
+def test_an_attempt_is_without_the_focal_length_of_exif(
+    photos: PhotoCollection, sfm_conf: SfmConf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: list[list[sfm.SfmImage]] = []
+
+    def reconstruct(sfm_images: list[sfm.SfmImage], *_: object) -> Reconstruction:
+        given.append(sfm_images)
+        return registered(2 if sfm_images[0].focal is None else 1)
+
+    monkeypatch.setattr(sfm, "reconstruct", reconstruct)
+    done = registration.register(
+        with_exif(photos, 300.0),
+        [1],
+        sfm_conf,
+        tmp_path,
+        lambda model: "" if len(model.viewmats) == 2 else "too few",
+    )
+    assert [a["attempt"] for a in done.attempts] == ["configured", "relaxed", "without_exif"]
+    assert all(image.focal for images_of in given[:-1] for image in images_of)
+    assert [image.focal for image in given[-1]] == [None, None]
+    assert done.refused == ""
+    (note,) = done.model.report["notes"]
+    assert note.startswith("the focal length in EXIF (300 mm of 35 mm film) was not used")
+
+
+def test_without_a_focal_length_in_exif_there_is_no_such_attempt(
+    photos: PhotoCollection, sfm_conf: SfmConf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sfm, "reconstruct", lambda *_: registered(1))
+    done = registration.register(
+        with_exif(photos, None), [1], sfm_conf, tmp_path, lambda _: "too few"
+    )
+    assert [a["attempt"] for a in done.attempts][-1] == "native"
+
+
+@pytest.mark.parametrize(("error", "taken"), [(0.5, True), (1.5, False)])
+@pytest.mark.parametrize("views", [1, 2])
+def test_views_that_fit_another_camera_are_tried_with_one(
+    photos: PhotoCollection,
+    sfm_conf: SfmConf,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    error: float,
+    taken: bool,
+    views: int,
+) -> None:
+    given: list[list[sfm.SfmImage]] = []
+
+    def reconstruct(sfm_images: list[sfm.SfmImage], *_: object) -> Reconstruction:
+        given.append(sfm_images)
+        found = registered(2 if len(given) == 1 else views)
+        errors = {"reprojection_error_px": 1.0 if len(given) == 1 else error}
+        apart = {1: 1} if len(given) == 1 else {}
+        return replace(found, report=found.report | errors, apart=apart)
+
+    monkeypatch.setattr(sfm, "reconstruct", reconstruct)
+    known = with_exif(photos, 28.0)
+    done = registration.register(known, [1], sfm_conf, tmp_path, lambda _: "")
+    assert [a["attempt"] for a in done.attempts] == ["configured", "cameras_apart"]
+    first, second = given
+    assert second[0] == first[0]
+    assert second[1].camera not in {first[0].camera, first[1].camera}
+    assert second[1].focal is None
+    is_taken = taken and views == 2
+    assert done.attempt.apart == ({1: 1} if is_taken else {})
+    notes = done.model.report["notes"]
+    assert len(notes) == is_taken
+    assert not notes or f"{known.names[1]} fit with another focal length" in notes[0]
 
 
 def test_of_refused_attempts_with_equally_many_views_the_first_is_returned(
@@ -154,10 +233,10 @@ def test_half_of_the_inliers_are_never_fewer_than_colmaps_six(
 def test_small_images_are_upsampled_or_have_a_camera_of_their_own(
     photos: PhotoCollection, sfm_conf: SfmConf
 ) -> None:
-    upsampled = registration.sfm_images(photos, [1], sfm_conf)
+    upsampled = registration.sfm_images(photos, [1], attempt(sfm_conf))
     assert [image.file for image in upsampled] == ["sfm/00000.png", "sfm_lr_up/00001.png"]
     assert images.size(photos.folder / "sfm_lr_up/00001.png") == photos.size("sfm", 1)
-    native = registration.sfm_images(photos, [1], replace(sfm_conf, lr_images="native"))
+    native = registration.sfm_images(photos, [1], attempt(replace(sfm_conf, lr_images="native")))
     assert [image.file for image in native] == ["sfm/00000.png", "sfm_lr/00001.png"]
     assert pytest.approx(upsampled[0].K) == native[0].K
     native_K, upsampled_K = native[1].K, upsampled[1].K
@@ -176,7 +255,7 @@ def test_photographs_that_are_smaller_from_the_start_are_upsampled_for_one_camer
     files = {file.stem: file for file in sorted(tmp_path.iterdir())}
     conf = configured(long_side=300, factor=2, sfm={"long_side": 200})
     made = prepare_hr_views(scenes.Scene("x", "", files), conf, tmp_path, for_sfm=True)
-    given = registration.sfm_images(made, (), sfm_conf)
+    given = registration.sfm_images(made, (), attempt(sfm_conf))
     assert [image.name for image in given] == list(files)
     assert [made.size("sfm", i) for i in (0, 1, 16)] == [(200, 150), (40, 30), (100, 150)]
     wanted = {(400, 300): (200, 150), (81, 61): (200, 150), (200, 300): (100, 150)}
@@ -185,7 +264,7 @@ def test_photographs_that_are_smaller_from_the_start_are_upsampled_for_one_camer
     cameras = [image.camera for image in given]
     assert len(set(cameras)) == 3
     assert cameras[:2] * 8 == cameras[:16]
-    native = registration.sfm_images(made, (), replace(sfm_conf, lr_images="native"))
+    native = registration.sfm_images(made, (), attempt(replace(sfm_conf, lr_images="native")))
     assert images.size(tmp_path / native[1].file) == (40, 30)
 
 
@@ -215,7 +294,7 @@ def test_exif_gives_the_focal_length_to_begin_with(
     files = {name: tmp_path / f"{name}.jpg" for name in ("a", "b")}
     conf = configured(sfm={"long_side": 200})
     made = prepare_hr_views(scenes.Scene("x", "", files), conf, tmp_path, for_sfm=True)
-    for image in registration.sfm_images(made, (), sfm_conf):
+    for image in registration.sfm_images(made, (), attempt(sfm_conf)):
         assert image.focal == pytest.approx(250 * 28 / 43.2666, rel=1e-4)
 
 
@@ -227,6 +306,6 @@ def test_a_degraded_copy_of_full_size_is_given_as_it_is(
     made = prepare_hr_views(scene, conf, tmp_path, for_sfm=True)
     write_degraded(made, [1], conf, "sfm_lr")
     for lr_images in ("upsampled", "native"):
-        given = registration.sfm_images(made, [1], replace(sfm_conf, lr_images=lr_images))
+        given = registration.sfm_images(made, [1], attempt(replace(sfm_conf, lr_images=lr_images)))
         assert [image.file for image in given] == ["sfm/00000.png", "sfm_lr/00001.png"]
     assert not (tmp_path / "sfm_lr_up").exists()

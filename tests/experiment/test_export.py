@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -10,9 +12,11 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from scipy.spatial import cKDTree
 
 import xrgs
 from xrgs.capture import images
+from xrgs.capture.colmap import read_points
 from xrgs.capture.frozen import freeze
 from xrgs.capture.views import Variant, View
 from xrgs.experiment.export import export, without_invisible
@@ -120,3 +124,40 @@ def test_gaussians_that_no_render_shows_are_left_out(
         for some in (gaussians, shown)
     )
     torch.testing.assert_close(before, after, rtol=0, atol=1e-6)  # sums have another order
+
+
+def test_the_transform_leads_from_the_world_of_given_poses(tmp_path: Path) -> None:
+    """Points of the user's world, far from its origin, land on the exported points."""
+    variant = masked_variant(tmp_path)
+    world = np.eye(4)
+    world[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    world[:3, 3] = (4_600_000.25, -500_000.5, 120)
+    given = (variant.points - world[:3, 3]) @ world[:3, :3]
+    moved = freeze_again(replace(variant, world=world), tmp_path)
+    assert np.array_equal(moved.world, world)
+    assert moved.id != variant.id
+    export(moved.folder, "nerfstudio", tmp_path / "out")
+    content = json.loads((tmp_path / "out" / "transform.json").read_text())
+    matrix = np.array(content["sfm_to_export"])
+    exported, _ = read_points(tmp_path / "out" / "points.ply")
+    found = given @ matrix[:3, :3].T + matrix[:3, 3]
+    # 64 bits round 5e6 to 1e-9; the .ply has its points in another order and in 32 bits.
+    distances, nearest = cKDTree(exported).query(found)
+    assert sorted(nearest) == list(range(len(found)))
+    assert distances.max() < 1e-6 * np.abs(exported).max()
+
+
+def freeze_again(variant: Variant, folder: Path) -> Variant:
+    made = folder / "again"
+    shutil.copytree(variant.folder, made)
+    for name in ("variant.json", "points.npz", "report.json"):
+        (made / name).unlink()
+    views = [
+        replace(
+            view,
+            file=made / view.file.relative_to(variant.folder),
+            mask=view.mask and made / view.mask.relative_to(variant.folder),
+        )
+        for view in variant.views
+    ]
+    return freeze(replace(variant, views=tuple(views)), "1" * 16, made, folder / "variants", {})

@@ -41,7 +41,7 @@ from tests.hostile.mutations import (
     mutate_npz,
 )
 from xrgs import composing
-from xrgs.capture import colmap, frozen, images, poses
+from xrgs.capture import colmap, exif, frozen, images, poses
 from xrgs.capture.folders import read_failure
 from xrgs.capture.photographs import PhotoCollection, prepare_hr_views
 from xrgs.capture.scenes import Scene
@@ -95,7 +95,7 @@ def deep(_: Path) -> bytes:
 
 
 def look(file: Path) -> object:
-    return images.size(file), images.exif_camera(file), images.read(file)
+    return images.size(file), exif.read(file).camera, images.read(file)
 
 
 def of_store(pattern: str) -> Callable[[Path], bytes]:

@@ -36,13 +36,34 @@ Chromaticities = tuple[float, float, float, float, float, float, float, float]
 """x and y of white, red, green and blue, as in a PNG's cHRM."""
 SRGB: Chromaticities = (0.3127, 0.329, 0.64, 0.33, 0.3, 0.6, 0.15, 0.06)
 _ADOBE: Chromaticities = (0.3127, 0.329, 0.64, 0.33, 0.21, 0.71, 0.15, 0.06)
-_P3: Chromaticities = (0.3127, 0.329, 0.68, 0.32, 0.265, 0.69, 0.15, 0.06)
-_BT2020: Chromaticities = (0.3127, 0.329, 0.708, 0.292, 0.17, 0.797, 0.131, 0.046)
-#: Colour spaces by ITU-T H.273's number of their primaries.
-_H273_PRIMARIES = {9: ("BT.2020", _BT2020), 12: ("Display P3", _P3)}
-#: The curves of H.273 that are treated as sRGB's, which they differ from by little. 2 is unknown.
-_H273_SRGB = (1, 2, 6, 13, 14, 15)
-_H273_HDR = {16: "PQ", 18: "HLG"}
+#: Colour spaces by ITU-T H.273's number of their primaries, but for sRGB's own.
+_H273_PRIMARIES: dict[int, tuple[str, Chromaticities]] = {
+    4: ("BT.470 M", (0.31, 0.316, 0.67, 0.33, 0.21, 0.71, 0.14, 0.08)),
+    5: ("BT.601 of 625 lines", (0.3127, 0.329, 0.64, 0.33, 0.29, 0.6, 0.15, 0.06)),
+    6: ("BT.601 of 525 lines", (0.3127, 0.329, 0.63, 0.34, 0.31, 0.595, 0.155, 0.07)),
+    7: ("SMPTE 240M", (0.3127, 0.329, 0.63, 0.34, 0.31, 0.595, 0.155, 0.07)),
+    8: ("generic film", (0.31, 0.316, 0.681, 0.319, 0.243, 0.692, 0.145, 0.049)),
+    9: ("BT.2020", (0.3127, 0.329, 0.708, 0.292, 0.17, 0.797, 0.131, 0.046)),
+    10: ("CIE XYZ", (1 / 3, 1 / 3, 1.0, 0.0, 0.0, 1.0, 0.0, 0.0)),
+    11: ("DCI-P3", (0.314, 0.351, 0.68, 0.32, 0.265, 0.69, 0.15, 0.06)),
+    12: ("Display P3", (0.3127, 0.329, 0.68, 0.32, 0.265, 0.69, 0.15, 0.06)),
+    22: ("EBU Tech 3213", (0.3127, 0.329, 0.63, 0.34, 0.295, 0.605, 0.155, 0.077)),
+}
+#: H.273's numbers of sRGB's primaries, and those that stand for unknown ones.
+_H273_SRGB_PRIMARIES = (0, 1, 2, 3)
+#: The curves of H.273 that are shown as sRGB's, which they differ from by little: those of cameras
+#: for BT.709 and its relatives, and sRGB's own. 0, 2 and 3 are unknown ones.
+_H273_SRGB = (0, 1, 2, 3, 6, 11, 12, 13, 14, 15)
+#: The curves of H.273 that are powers, by the exponent that decodes a value.
+_H273_GAMMA = {4: 2.2, 5: 2.8, 8: 1.0}
+_H273_SMPTE_240M, _H273_SMPTE_428 = 7, 17
+#: Curves that no photograph for a screen has, and the reason why they are not converted.
+_H273_REFUSED = {
+    9: "logarithmic brightness",
+    10: "logarithmic brightness",
+    16: "HDR (PQ)",
+    18: "HDR (HLG)",
+}
 #: Differences in x and y, and of a curve's exponent in proportion, that are sRGB rounded.
 _SAME_XY, _SAME_GAMMA = 0.005, 0.05
 
@@ -63,24 +84,44 @@ class Encoding:
     primaries: Chromaticities = SRGB
     gamma: float | None = None
     """The exponent that decodes a value; None is sRGB's curve."""
+    smpte: int | None = None
+    """The number in H.273 of a curve of SMPTE's, 240M or ST 428-1, in place of `gamma`."""
+    narrow_bits: int = 0
+    """The bits of values of narrow range, whose black is 16 and whose white 235 of 8 bits; 0 where
+    values have the full range."""
 
 
-def from_h273(primaries: int, transfer: int) -> Encoding | None:
+def from_h273(primaries: int, transfer: int, narrow_bits: int = 0) -> Encoding | None:
     """Return the encoding of a HEIC file or of a PNG's cICP, by the numbers of ITU-T H.273.
 
+    Args:
+        primaries: H.273's ColourPrimaries.
+        transfer: Its TransferCharacteristics.
+        narrow_bits: As in `Encoding`.
+
     Returns:
-        None where it is sRGB's, or where the numbers are unknown or reserved.
+        None where it is sRGB's of full range, or where the file says that it is not known.
 
     Raises:
-        ColourError: The curve is that of HDR, which has no white to scale by.
+        ColourError: The curve is that of HDR, which has no white to scale by, or a logarithm, or a
+            number is not known here.
     """
-    if transfer in _H273_HDR:
-        raise ColourError(f"its brightness is HDR ({_H273_HDR[transfer]}); save it as SDR")
-    linear = transfer == 8
-    if primaries not in _H273_PRIMARIES:
-        return Encoding("linear sRGB", gamma=1.0) if linear else None
-    name, xy = _H273_PRIMARIES[primaries]
-    return Encoding(f"linear {name}" if linear else name, xy, 1.0 if linear else None)
+    if transfer in _H273_REFUSED:
+        raise ColourError(f"its brightness is {_H273_REFUSED[transfer]}; save it as SDR")
+    powers = transfer in _H273_SRGB or transfer in _H273_GAMMA
+    if not powers and transfer not in (_H273_SMPTE_240M, _H273_SMPTE_428):
+        raise ColourError(f"its curve is number {transfer} of H.273, not known; save it as sRGB")
+    if primaries not in _H273_PRIMARIES and primaries not in _H273_SRGB_PRIMARIES:
+        raise ColourError(f"its primaries are number {primaries} of H.273, not known")
+    name, xy = _H273_PRIMARIES.get(primaries, ("sRGB", SRGB))
+    if transfer in _H273_SRGB and xy == SRGB and not narrow_bits:
+        return None
+    gamma = _H273_GAMMA.get(transfer)
+    smpte = None if powers else transfer
+    curve = {1.0: "linear ", None: ""}.get(gamma, f"gamma {gamma} ")
+    curve = {_H273_SMPTE_240M: "SMPTE 240M ", _H273_SMPTE_428: "ST 428-1 "}.get(transfer, curve)
+    words = f"narrow-range {curve}{name}" if narrow_bits else f"{curve}{name}"
+    return Encoding(words, xy, gamma, smpte, narrow_bits)
 
 
 def adobe_rgb() -> Encoding:
@@ -228,12 +269,11 @@ def from_lab(image: Image.Image) -> NDArray[np.uint8]:
 
 def _by_encoding(rgb: NDArray[np.float32], encoding: Encoding) -> NDArray[np.float32]:
     """Decode by the curve, change the primaries, encode by sRGB's curve, and clip to 0..1."""
-    if encoding.gamma is None:
-        linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
-    else:
-        linear = rgb**encoding.gamma
+    if encoding.narrow_bits:
+        eighth_bits = np.float32((2**encoding.narrow_bits - 1) / 2 ** (encoding.narrow_bits - 8))
+        rgb = np.clip((rgb * eighth_bits - 16) / 219, 0, 1)
     matrix = np.linalg.inv(_to_xyz(SRGB)) @ _to_xyz(encoding.primaries)
-    linear = np.clip(linear @ matrix.T.astype(np.float32), 0, 1)
+    linear = np.clip(_linear(rgb, encoding) @ matrix.T.astype(np.float32), 0, 1)
     dark = linear <= 0.0031308
     encoded: NDArray[np.float32] = np.where(
         dark, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055
@@ -241,16 +281,30 @@ def _by_encoding(rgb: NDArray[np.float32], encoding: Encoding) -> NDArray[np.flo
     return encoded.astype(np.float32)
 
 
+def _linear(rgb: NDArray[np.float32], encoding: Encoding) -> NDArray[np.float32]:
+    """Decode values in 0..1 by the curve of an encoding; white is 1."""
+    linear: NDArray[np.float32]
+    if encoding.smpte == _H273_SMPTE_240M:
+        linear = np.where(rgb < 4 * 0.0228, rgb / 4, ((rgb + 0.1115) / 1.1115) ** (1 / 0.45))
+    elif encoding.smpte == _H273_SMPTE_428:  # of cinemas, whose white is 48 of 52.37 cd/m²
+        linear = np.minimum(52.37 / 48 * rgb**2.6, 1)
+    elif encoding.gamma is None:
+        linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    else:
+        linear = rgb**encoding.gamma
+    return linear
+
+
 def _to_xyz(xy: Chromaticities) -> NDArray[np.float64]:
     """Return the matrix [3, 3] from linear RGB to XYZ, adapted to sRGB's white (Bradford)."""
-    white, *primaries = (_xyz(x, y) for x, y in zip(xy[::2], xy[1::2], strict=True))
-    columns = np.stack(primaries, axis=1)
-    matrix = columns * np.linalg.solve(columns, white)
-    cones, target = _BRADFORD @ white, _BRADFORD @ _xyz(*SRGB[:2])
-    adaptation: NDArray[np.float64] = np.linalg.solve(
-        _BRADFORD, (target / cones)[:, None] * _BRADFORD
+    white, *primaries = zip(xy[::2], xy[1::2], strict=True)
+    columns = np.array([(x, y, 1 - x - y) for x, y in primaries]).T
+    matrix = columns * np.linalg.solve(columns, _xyz(*white))
+    cones, target = _BRADFORD @ _xyz(*white), _BRADFORD @ _xyz(*SRGB[:2])
+    adapted: NDArray[np.float64] = np.linalg.solve(
+        _BRADFORD, (target / cones)[:, None] * (_BRADFORD @ matrix)
     )
-    return adaptation @ matrix
+    return adapted
 
 
 def _xyz(x: float, y: float) -> NDArray[np.float64]:

@@ -57,6 +57,11 @@ def decode_png(content: bytes, significant: int) -> DeepPixels:
     return DeepPixels(scaled, alpha, note)
 
 
+def of_grey(samples: NDArray[Any]) -> DeepPixels:
+    """Take grey samples [H, W] of 16 bits, as Pillow decodes them."""
+    return DeepPixels(_scaled(samples[..., None], _WHITE, _WHITE)[0], None)
+
+
 def decode_heif(stream: BinaryIO) -> DeepPixels:
     """Decode the primary image of a HEIC file of 10 or 12 bits, upright."""
     import pillow_heif

@@ -2,7 +2,8 @@
 
 The folder is named by the variant's id. `variant.json` (`Manifest`) lists the views and the hash
 of every other file that decides a number: `images/<split>/<view>.png`, the masks
-`images/<split>-masks/<view>.png` of the views that have one, and `points.npz`, the SfM points.
+`images/<split>-masks/<view>.png` of the views that have one, and `points.npz`, the SfM points and,
+where poses were given, the transform from their world.
 `report.json` says how SfM went, and `colmap.log` is COLMAP's log.
 """
 
@@ -99,7 +100,10 @@ def freeze(made: Variant, key: str, folder: Path, variants: Path, code: dict[str
         The variant, as it is read from its new place.
     """
     with atomic_writer(folder / POINTS, durable=False) as stream:
-        np.savez(stream, points=made.points, colors=made.colors)
+        if np.array_equal(made.world, np.eye(4)):
+            np.savez(stream, points=made.points, colors=made.colors)
+        else:
+            np.savez(stream, points=made.points, colors=made.colors, world=made.world)
     write_json(folder / REPORT, made.report, durable=False)
     views = tuple(_entry(folder, view) for view in made.views)
     manifest = Manifest(
@@ -193,6 +197,7 @@ def _assembled(folder: Path, manifest: Manifest) -> Variant:
         with errors_named(file), file.open("rb") as stream:
             arrays = npz.read(stream)
         points, colors = arrays["points"], arrays["colors"]
+        world = arrays.get("world", np.eye(4))
     except (ValueError, KeyError) as error:
         raise StoreError(
             f"damaged: {file}: not the points of a variant ({error!r:.200})"
@@ -209,6 +214,8 @@ def _assembled(folder: Path, manifest: Manifest) -> Variant:
         )
     if not (np.abs(points) <= _MAX_COORDINATE).all():
         raise StoreError(f"damaged: {file}: points: not finite, or beyond {_MAX_COORDINATE:g}")
+    if world.dtype != np.float64 or world.shape != (4, 4) or not np.isfinite(world).all():
+        raise StoreError(f"damaged: {file}: world: {world.dtype} {world.shape}, not float64 [4, 4]")
     return Variant(
         manifest.id,
         folder,
@@ -219,6 +226,7 @@ def _assembled(folder: Path, manifest: Manifest) -> Variant:
         points,
         colors,
         read_struct(folder / REPORT, dict[str, Any]),
+        world,
     )
 
 

@@ -1,7 +1,8 @@
 """Reads, resizes and saves photographs: float32 arrays [H, W, 3] in 0..1 in memory.
 
-Photographs of users are read in six formats, upright by their EXIF orientation, in sRGB by their
-ICC profile, and with all of their bits. HEIC needs pillow-heif, which is an extra. Of a file of
+Photographs of users are read upright by their EXIF orientation, and in sRGB by their ICC profile or
+the colours that they name. PNG, TIFF and HEIC keep all of their bits. HEIC needs pillow-heif, which
+is an extra. Of a file of
 several images the first is read (the primary one of HEIC, and of the JPEGs that phones write with
 gain maps or depth). The images of a store are PNGs of `save`, and are read by `read_png` alone.
 Nothing here imports torch before `resize` is called.
@@ -10,6 +11,7 @@ Nothing here imports torch before `resize` is called.
 from __future__ import annotations
 
 import io
+import struct
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -19,7 +21,7 @@ from typing import IO, TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageOps, UnidentifiedImageError
+from PIL import Image, ImageOps, UnidentifiedImageError, features
 from PIL.PngImagePlugin import PngInfo
 
 from xrgs.capture import colour, deep
@@ -33,25 +35,41 @@ if TYPE_CHECKING:
 ImageArray = NDArray[np.float32]  # [H, W, 3]
 
 #: The formats that are read. PIL goes by the content of a file and not by its suffix, and it hands
-#: some of the other formats that it knows to external programs.
-_FORMATS = ("BMP", "HEIF", "JPEG", "PNG", "TIFF", "WEBP")
+#: some of the other formats that it knows to external programs. A TGA has no mark at its beginning,
+#: so that only its suffix tells it.
+_FORMATS = ("AVIF", "BMP", "HEIF", "JPEG", "JPEG2000", "PNG", "PPM", "TIFF", "WEBP")
+_TGA = frozenset({".tga"})
 #: The suffixes of HEIC files, in lower case.
 HEIC = frozenset({".heic", ".heif", ".hif"})
+#: The suffixes that cameras and programs of today write, in lower case.
+USUAL_SUFFIXES = HEIC | {".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"}
 #: The suffixes of files that are read as photographs and as masks, in lower case.
-SUFFIXES = HEIC | {".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"}
+SUFFIXES = (
+    USUAL_SUFFIXES
+    | {".apng", ".avif", ".dib", ".j2k", ".jfi", ".jfif", ".jif", ".jp2", ".jpe", ".jpf", ".jpx"}
+    | {".mpo", ".pbm", ".pgm", ".pnm", ".ppm"}
+    | _TGA
+)
 #: What the PNGs of this package have in their text chunk `Software`.
 SOFTWARE = "xrgs"
 #: How files begin that people take for photographs of these formats, and what they are.
 _OTHER_FORMATS = {
     b"\xff\x0a": "JPEG XL",
     b"\0\0\0\x0cJXL ": "JPEG XL",
-    b"\0\0\0\x0cjP  ": "JPEG 2000",
     b"GIF8": "GIF",
     b"8BPS": "a Photoshop document",
 }
-_AVIF_BRANDS = (b"avif", b"avis")
-#: What a HEIC file has after its first four bytes, as other files of its container do.
-_HEIF_MAGIC = b"ftyp"
+#: What the files of a container have after their first four bytes, and which of them are AVIF.
+_HEIF_MAGIC, _AVIF_BRANDS = b"ftyp", (b"avif", b"avis")
+#: What follows it in photographs of this container, as films of it have other names there.
+_HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1", *_AVIF_BRANDS)
+#: How files begin whose content tells that they are photographs. BMP and PPM begin with two letters
+#: as texts may, and raw files of cameras begin as TIFF does.
+_PHOTOGRAPH_MAGIC = (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"\0\0\0\x0cjP  ")
+#: Where a JPEG 2000 and an AVIF file have the box of their colours, in bytes from the beginning.
+_BOXES_BYTES = 1 << 20
+#: The colours of JPEG 2000 by number: CMYK, sRGB, grey, and sRGB's YCC, which are decoded as such.
+_JP2_COLOURS = (12, 16, 17, 18)
 _TIFF_MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 #: The chunks of a PNG that may hold EXIF or XMP.
@@ -73,11 +91,8 @@ _BITS = {"1": 1, "P": 1, "L": 8}
 #: With `scene.alpha=mask`, pixels of a lower alpha are outside. Our choice.
 OPAQUE_FROM = 0.5
 _EXIF_ORIENTATION = 0x0112
-_EXIF_CAMERA = (0x010F, 0x0110)  # make, model
 _EXIF_DETAILS, _EXIF_COLOUR_SPACE, _EXIF_INTEROPERABILITY = 0x8769, 0xA001, 0xA005
-_EXIF_FOCAL_35MM = 0xA405  # the focal length that has this field of view on 35 mm film
-_EXIF_FOCAL = (0x920A, _EXIF_FOCAL_35MM)  # in mm
-_TIFF_PROFILE = 34675
+_TIFF_PROFILE, _TIFF_XMP = 34675, 700
 
 
 class ImageError(XrgsError):
@@ -152,21 +167,42 @@ def _check_size(
         raise _RefusedError(f"{file_bytes} bytes are too few for {width} x {height} px")
 
 
-def _formats(start: bytes) -> tuple[str, ...]:
+def _formats(start: bytes, suffix: str) -> tuple[str, ...]:
     """Return the formats that a file which begins so may have; HEIF is registered for HEIF."""
     for magic, name in _OTHER_FORMATS.items():
         if start.startswith(magic):
             raise _RefusedError(f"it is {name}, which is not read; convert it to PNG or JPEG")
     if start[4:8] != _HEIF_MAGIC:
-        return tuple(name for name in _FORMATS if name != "HEIF")
+        others = tuple(name for name in _FORMATS if name not in ("HEIF", "AVIF"))
+        return (*others, "TGA") if suffix.lower() in _TGA else others
     if start[8:12] in _AVIF_BRANDS:
-        raise _RefusedError("it is AVIF, which is not read; convert it to PNG or JPEG")
+        if not features.check("avif"):
+            raise _RefusedError("it is AVIF, which this Pillow does not read; install a newer one")
+        return ("AVIF",)
     try:
         from pillow_heif import register_heif_opener
     except ImportError as error:
         raise _RefusedError("HEIC needs pillow-heif: pip install 'xrgs[heic]'") from error
     register_heif_opener()
-    return _FORMATS
+    return ("HEIF",)
+
+
+def is_photograph(path: Path) -> bool | None:
+    """Tell from the first bytes of a file without an image's suffix whether it is a photograph.
+
+    Returns:
+        None where it may be an image of a format that is not read.
+
+    Raises:
+        OSError: The file can't be read.
+    """
+    with path.open("rb") as stream:
+        start = stream.read(16)
+    if start.startswith(_PHOTOGRAPH_MAGIC) or (start[:4], start[8:12]) == (b"RIFF", b"WEBP"):
+        return True
+    if start[4:8] == _HEIF_MAGIC:
+        return start[8:12] in _HEIF_BRANDS
+    return None if start.startswith((*_OTHER_FORMATS, *_TIFF_MAGIC)) else False
 
 
 @dataclass(frozen=True)
@@ -227,6 +263,10 @@ class _File(Protocol):
     note: str
 
     @property
+    def xmp(self) -> str:
+        """Return the XMP of the file, empty where it has none."""
+
+    @property
     def frames(self) -> int:
         """Return how many images the file has, but for those that belong to one."""
 
@@ -240,20 +280,26 @@ class _File(Protocol):
 class _PilFile:
     """A photograph that PIL opens; `deep` decodes the PNGs and HEIC files of more than 8 bits."""
 
-    def __init__(self, stream: BinaryIO, start: bytes, note: str = "") -> None:
+    def __init__(self, stream: BinaryIO, start: bytes, path: Path, note: str = "") -> None:
         self._stream, self.note = stream, note
-        self.image = image = Image.open(stream, formats=_formats(start))
+        self.image = image = Image.open(stream, formats=_formats(start, path.suffix))
         is_heif, is_png = image.format == "HEIF", image.format == "PNG"
         self._chunks, has_late_exif = _png_chunks(stream) if is_png else ({}, False)
         self.channels, self.bits = len(image.getbands()), int(image.info.get("bit_depth", 8))
         if is_png:
             self.bits, colour_type = self._chunks[b"IHDR"][8:10]
             self.channels = _PNG_CHANNELS[colour_type]
+        elif image.mode.startswith("I"):  # grey of a PGM or a JPEG 2000
+            self.bits = 16
         deep_bits = self.channels * self.bits if self.bits > 8 else 0
         _check_size(stream, image.size, MAX_PIXELS, deep_bits or _BITS.get(image.mode, 24))
         self.profile: bytes | None = image.info.get("icc_profile")
         if b"cICP" in self._chunks:  # PNG's third edition puts it above the profile
             self.profile = None
+        has_box = image.format in ("AVIF", "JPEG2000")
+        self._box = _colour_box(stream, image.format == "AVIF") if has_box else b""
+        if image.format == "JPEG2000" and self._box[:1] == b"\2":
+            self.profile = self._box[3:]
         self.exif = Image.Exif()
         with suppress(Exception):  # PIL raises nearly anything on damaged EXIF
             # A PNG's own method decodes the pixels, to look for EXIF behind them.
@@ -265,6 +311,11 @@ class _PilFile:
             self.size = image.tag_v2[256], image.tag_v2[257]  # type: ignore[attr-defined]
 
     @property
+    def xmp(self) -> str:
+        found = self.image.info.get("xmp") or self.image.info.get("XML:com.adobe.xmp") or b""
+        return found if isinstance(found, str) else found.decode("utf-8", errors="replace")
+
+    @property
     def frames(self) -> int:
         # The others of a JPEG are gain maps, depth, or the other half of a stereo pair.
         is_jpeg = self.image.format in ("JPEG", "MPO")
@@ -272,16 +323,28 @@ class _PilFile:
 
     def encoding(self) -> colour.Encoding | None:
         info = self.image.info
-        if cicp := self._chunks.get(b"cICP"):
-            return colour.from_h273(cicp[0], cicp[1])
+        cicp = self._chunks.get(b"cICP", b"")
+        if len(cicp) == 4:
+            if cicp[2]:
+                raise colour.ColourError("its cICP names a matrix, which a PNG's colours have not")
+            return colour.from_h273(cicp[0], cicp[1], 0 if cicp[3] else self.bits)
         if self._chunks:
             known = "srgb" in info
             xy = info.get("chromaticity")
             return None if known else colour.from_png(info.get("gamma"), xy)
         if nclx := info.get("nclx_profile"):
+            if not int(nclx["matrix_coefficients"]) and not int(nclx["full_range_flag"]):
+                raise colour.ColourError("RGB values of narrow range are not read; save it as PNG")
             return colour.from_h273(
                 int(nclx["color_primaries"]), int(nclx["transfer_characteristics"])
             )
+        if self._box[:4] == b"nclx":  # of AVIF; its range is that of the decoder's input
+            primaries, transfer = struct.unpack_from(">HH", self._box, 4)
+            return colour.from_h273(primaries, transfer)
+        if self._box[:1] == b"\1":
+            (number,) = struct.unpack_from(">I", self._box, 3)
+            if number not in _JP2_COLOURS:
+                raise colour.ColourError(f"colours of kind {number} of JPEG 2000 are not read")
         with suppress(Exception):  # as for EXIF itself
             interoperability = self.exif.get_ifd(_EXIF_INTEROPERABILITY).get(1, "")
             space = self.exif.get_ifd(_EXIF_DETAILS).get(_EXIF_COLOUR_SPACE)
@@ -295,6 +358,8 @@ class _PilFile:
             self._stream.seek(0)
             if image.format == "HEIF":
                 found = deep.decode_heif(self._stream)
+            elif image.format != "PNG":
+                found = deep.of_grey(np.asarray(image))
             else:
                 significant = max(self._chunks.get(b"sBIT", b"\x10"))
                 found = deep.decode_png(self._stream.read(), significant)
@@ -333,6 +398,11 @@ class _DeepTiff:
             self.exif.load_from_fp(stream)
 
     @property
+    def xmp(self) -> str:
+        found = self._tiff.value(_TIFF_XMP, b"")
+        return found.decode("utf-8", errors="replace") if isinstance(found, bytes) else ""
+
+    @property
     def frames(self) -> int:
         return self._tiff.frames
 
@@ -344,16 +414,26 @@ class _DeepTiff:
         return _Samples(found.colours, found.alpha, found.note)
 
 
-def _file(stream: BinaryIO) -> _File:
+def _file(stream: BinaryIO, path: Path) -> _File:
     start = stream.read(16)
     stream.seek(0)
     if start[:4] not in _TIFF_MAGIC:
-        return _PilFile(stream, start)
+        return _PilFile(stream, start, path)
     tiff = deep.Tiff(stream)
     if tiff.is_deep:
         return _DeepTiff(stream, tiff)
     stream.seek(0)
-    return _PilFile(stream, start, tiff.note)
+    return _PilFile(stream, start, path, tiff.note)
+
+
+def _colour_box(stream: BinaryIO, is_avif: bool) -> bytes:
+    """Return what the box of colours of a JPEG 2000 or AVIF file has; empty where there is none."""
+    stream.seek(0)
+    start = stream.read(_BOXES_BYTES)
+    at = start.find(b"colrnclx" if is_avif else b"colr")
+    if at < 4:
+        return b""
+    return start[at + 4 : at - 4 + int.from_bytes(start[at - 4 : at], "big")]
 
 
 def _png_chunks(stream: BinaryIO) -> tuple[dict[bytes, bytes], bool]:
@@ -401,7 +481,7 @@ def header(path: Path) -> Header:
         ImageError: The file is not an image, or is larger than `MAX_PIXELS`.
     """
     with _stream(path) as stream:
-        return _header(_file(stream))
+        return _header(_file(stream, path))
 
 
 def _header(file: _File) -> Header:
@@ -443,48 +523,36 @@ def thumbnail(path: Path, side: int) -> NDArray[np.uint8]:
         ImageError: The file is unreadable or truncated.
     """
     with _stream(path) as stream:
-        file = _file(stream)
+        file = _file(stream, path)
         if isinstance(file, _PilFile) and file.bits <= 8:
             # JPEGs are decoded at down to an eighth of their size.
             file.image.draft("RGB", (16 * side, 16 * side))
             upright = ImageOps.exif_transpose(file.image).convert("RGB")
             return _small(upright, side)
-    return _small(Image.fromarray(to_8_bit(decode(path).pixels)), side)
+    return small(decode(path).pixels, side)
+
+
+def small(image: ImageArray, side: int) -> NDArray[np.uint8]:
+    """Return a small grey picture [side, side] of an image [H, W, 3]."""
+    return _small(Image.fromarray(to_8_bit(image)), side)
 
 
 def _small(image: Image.Image, side: int) -> NDArray[np.uint8]:
     return np.asarray(image.convert("L").resize((side, side), Image.Resampling.BOX))
 
 
-def exif_camera(path: Path) -> str:
-    """Read from EXIF which camera and focal length took a photograph.
-
-    Returns:
-        `make/model/focal length/35 mm equivalent`; empty where EXIF has none of them.
+def metadata(path: Path) -> tuple[Image.Exif, dict[int, Any], str]:
+    """Read EXIF of a photograph, the tags of how it was taken, and XMP; empty where it has none.
 
     Raises:
         UnreadableError: The file can't be read now.
         ImageError: The file is not an image.
     """
     with _stream(path) as stream:
-        exif, details = _file(stream).exif, {}
+        file, details = _file(stream, path), {}
         with suppress(Exception):  # PIL raises nearly anything on damaged EXIF
-            details = exif.get_ifd(_EXIF_DETAILS)
-        values = [exif.get(tag) for tag in _EXIF_CAMERA] + [details.get(t) for t in _EXIF_FOCAL]
-    return "/".join("" if value is None else str(value).strip("\0 ") for value in values).strip("/")
-
-
-def exif_focal(path: Path) -> float | None:
-    """Read from EXIF the focal length for a film of 36 x 24 mm, mm; None where it is not there.
-
-    Raises:
-        UnreadableError: The file can't be read now.
-        ImageError: The file is not an image.
-    """
-    with _stream(path) as stream, suppress(Exception):  # PIL raises nearly anything on damaged EXIF
-        focal = float(_file(stream).exif.get_ifd(_EXIF_DETAILS)[_EXIF_FOCAL_35MM])
-        return focal if 1 < focal < 10_000 else None
-    return None
+            details = file.exif.get_ifd(_EXIF_DETAILS)
+        return file.exif, details, file.xmp
 
 
 def decode(path: Path) -> Picture:
@@ -496,7 +564,7 @@ def decode(path: Path) -> Picture:
             no known white.
     """
     with _stream(path) as stream:
-        file = _file(stream)
+        file = _file(stream, path)
         head, several = _header(file), file.frames > 1
         samples = file.load()
         encoding = None if file.profile else file.encoding()

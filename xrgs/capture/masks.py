@@ -32,8 +32,10 @@ Mask = NDArray[np.bool_]  # [H, W], True for a pixel that is used
 _T = TypeVar("_T", np.float32, np.uint8)
 #: The folder of the masks of copies.
 MASKS = "masks"
+#: What programs call masks, in names of files and folders.
+WORDS = r"masks?|segmentations?|seg|segments|mattes?|silhouettes?"
 #: What programs write before or after the name of the photograph.
-_AFFIX = re.compile(r"^masks?[\W_]|[\W_]masks?$", re.IGNORECASE)
+_AFFIX = re.compile(rf"^(?:{WORDS}|alpha)[\W_]|[\W_](?:{WORDS}|alpha)$", re.IGNORECASE)
 #: The brightness from which a pixel of a mask is white: half-way to black.
 _WHITE = 0.5
 #: The brightness of 1 in an 8-bit mask, in which programs that write labels have 0 and 1.

@@ -22,7 +22,7 @@ from xrgs.capture.blur import blur_notes, lr_blur
 from xrgs.capture.degradations import DEGRADATIONS, resolve_degradation
 from xrgs.capture.lens import Lens
 from xrgs.capture.photographs import PhotoCollection, prepare_hr_views, write_degraded
-from xrgs.capture.registration import Registration
+from xrgs.capture.registration import Attempt, Registration
 from xrgs.capture.split import (
     Split,
     check_variant_conf,
@@ -90,7 +90,7 @@ def mix_resolutions(scene: Scene, conf: VariantConf, work: Path, out: Path) -> V
     report = _sfm_report(inputs, model) | {"attempts": registered.attempts}
     if registered.refused:
         raise _failure(inputs, registered, report, work)
-    report |= _pose_report(inputs, model, work)
+    report |= _pose_report(inputs, registered, work)
     depths = sampling.median_depths(model)
     if conf.tags in POLICIES and POLICIES[conf.tags].needs_depth:
         inputs = replace(inputs, split=_split_by_depth(photos, conf, model, depths))
@@ -103,8 +103,9 @@ def mix_resolutions(scene: Scene, conf: VariantConf, work: Path, out: Path) -> V
     report |= tags | masked | blurred | {"notes": notes}
     report["seconds"] = round(time.perf_counter() - start, 1)
     held_out = bool(inputs.split.test)
+    points, colors = model.points, model.colors
     return Variant(
-        "", out, scene.name, conf.factor, held_out, views, model.points, model.colors, report
+        "", out, scene.name, conf.factor, held_out, views, points, colors, report, model.world
     )
 
 
@@ -116,7 +117,7 @@ def _register(inputs: _Inputs, work: Path) -> Registration:
         if not len(model.points):
             write_degraded(photos, inputs.degraded, conf)
             model = triangulation.with_points(model, photos, inputs.degraded, conf.sfm, work)
-        return Registration(model, _refusal(inputs, model), conf.sfm, [])
+        return Registration(model, _refusal(inputs, model), Attempt("given", conf.sfm), [])
     write_degraded(photos, inputs.degraded, conf, "sfm_lr")
     return registration.register(
         photos, inputs.degraded, conf.sfm, work, lambda model: _refusal(inputs, model)
@@ -163,7 +164,7 @@ def _failure(
     said = [registered.refused]
     undegraded = None
     if conf.poses is None and inputs.degraded:
-        undegraded = registration.reconstruct_undegraded(photos, registered.conf, work)
+        undegraded = registration.reconstruct_undegraded(photos, registered.attempt, work)
         report = report | {"reference": _results(undegraded)}
         said.append(f"undegraded, {_placed(undegraded, photos.names)}")
     advice = ", ".join(_advice(inputs, model, undegraded))
@@ -225,17 +226,18 @@ def _lens_report(photos: PhotoCollection, model: Reconstruction) -> list[dict[st
     return [{"lens": asdict(lens), "views": views} for lens, views in names.items()]
 
 
-def _pose_report(inputs: _Inputs, model: Reconstruction, work: Path) -> dict[str, Any]:
+def _pose_report(inputs: _Inputs, registered: Registration, work: Path) -> dict[str, Any]:
     """Compare the poses with exact ones, or else with SfM of the undegraded photographs."""
     photos, exact = inputs.photos, inputs.scene.viewmats
-    estimated = {photos.names[i]: matrix for i, matrix in model.viewmats.items()}
+    estimated = {photos.names[i]: matrix for i, matrix in registered.model.viewmats.items()}
     if exact:
         return {"pose_error": pose_error(estimated, exact), "pose_error_against": "exact cameras"}
     given = inputs.conf.poses is not None
     if given or not inputs.conf.sfm.reference or not inputs.degraded:
         return {"pose_error": {}, "pose_error_against": ""}
     start = time.perf_counter()
-    reference = registration.reconstruct_undegraded(photos, inputs.conf.sfm, work)
+    attempt = replace(registered.attempt, conf=inputs.conf.sfm)
+    reference = registration.reconstruct_undegraded(photos, attempt, work)
     exact = {photos.names[i]: matrix for i, matrix in reference.viewmats.items()}
     seconds = round(time.perf_counter() - start, 1)
     return {

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from xrgs.capture import images, masks
+from xrgs.capture import exif, images, masks
 from xrgs.capture.degradations import DEGRADATIONS, resolve_degradation
 from xrgs.capture.lens import Lens, lens_of_model, undistort
 from xrgs.capture.masks import MASKS, Mask, Masks, copy_mask
@@ -275,6 +275,7 @@ def _photographs(
     numbers = {name: f"{i:05d}" for i, name in enumerate(scene.files)}
     names = sorted(geometries)
     files, sizes = [scene.files[name] for name in names], [headers[name].size for name in names]
+    taken = [exif.read(file) for file in files]
     shapes, cameras = largest_of_shape(sizes), assign_cameras(files, sizes, conf.sfm.camera)
     return tuple(
         Photograph(
@@ -286,10 +287,11 @@ def _photographs(
             sfm=_sfm_size(shape, sizes, conf),
             camera=camera,
             K=scene.intrinsics.get(name),
-            focal_35mm=images.exif_focal(scene.files[name]),
+            # Of a part of the picture, it may be the whole picture's.
+            focal_35mm=None if of.cut else of.focal_35mm,
             path=scene.files[name],
         )
-        for name, shape, camera in zip(names, shapes, cameras, strict=True)
+        for name, shape, camera, of in zip(names, shapes, cameras, taken, strict=True)
     )
 
 
@@ -448,7 +450,7 @@ def assign_cameras(
         sizes: Their width and height with the EXIF orientation applied, px: a camera held upright
             is another camera to SfM. All photographs with one name have one aspect ratio.
         policy: `variant.sfm.camera`: `single` for one camera, `per_image` for one each, `auto` for
-            one per aspect ratio and EXIF camera.
+            one per aspect ratio and EXIF camera, digital zoom and crop.
 
     Raises:
         XrgsError: The policy is `single`, but the aspect ratios differ.
@@ -465,16 +467,16 @@ def assign_cameras(
     own = [f"{i:05d}" for i in range(len(files))]
     if policy == "per_image":
         return own
-    exifs = [images.exif_camera(file) for file in files]
-    unknown = [size for size, exif in zip(sizes, exifs, strict=True) if not exif]
+    taken = [exif.read(file) for file in files]
+    unknown = [size for size, of in zip(sizes, taken, strict=True) if not of.camera]
     # Two tourists' photographs of one size are a coincidence; a camera takes many of its size.
     by_size = len(set(sizes)) == 1 or len(unknown) >= _LEAST_OF_SIZE * len(set(unknown))
     names = []
-    for i, (size, shape, exif) in enumerate(zip(sizes, shapes, exifs, strict=True)):
-        if exif:
-            names.append(f"{shape[0]}x{shape[1]} {exif}")
+    for i, (size, shape, of) in enumerate(zip(sizes, shapes, taken, strict=True)):
+        if of.camera:
+            names.append(f"{shape[0]}x{shape[1]} {of.camera} {of.cut}")
         else:
-            names.append(f"{size[0]}x{size[1]}" if by_size else own[i])
+            names.append(f"{size[0]}x{size[1]} {of.cut}" if by_size else own[i])
     return names
 
 

@@ -8,7 +8,12 @@ a camera of its size.
 
 The first attempt, `configured`, has the settings of `variant.sfm`. With `sfm.fallbacks`, the
 attempts of `FALLBACKS` follow in their order until a reconstruction is accepted. The first of them
-also follows where a reconstruction is accepted that lacks views.
+also follows where a reconstruction is accepted that lacks views. Where EXIF gives a focal length,
+which is the first guess of the others, an attempt without it comes second of them.
+
+Photographs that were cropped or zoomed may keep their EXIF, and share a camera with the others. The
+best reconstruction is tried for this: where views fit better with a camera of their own
+(`xrgs.capture.own_cameras`), the attempt `cameras_apart` gives them one.
 """
 
 from __future__ import annotations
@@ -16,12 +21,13 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from xrgs.capture import sfm
 from xrgs.capture.masks import copy_mask
+from xrgs.runtime.text import listed
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -55,6 +61,10 @@ class Attempt:
 
     name: str
     conf: SfmConf
+    uses_exif: bool = True
+    """Whether refinement begins with the focal lengths that EXIF gives."""
+    apart: Mapping[int, int] = field(default_factory=dict)
+    """The views that don't share the camera of their name; those of one number share one."""
 
 
 def relaxed(conf: SfmConf, images: int, *, any_smaller: bool) -> Attempt:  # noqa: ARG001
@@ -93,8 +103,8 @@ class Registration:
     model: sfm.Reconstruction
     refused: str
     """Why even the best reconstruction is not accepted; empty where it is."""
-    conf: SfmConf
-    """The settings of its attempt."""
+    attempt: Attempt
+    """How it was made."""
     attempts: list[dict[str, Any]]
     """For each attempt its name, why it was refused, its seconds, settings and results."""
 
@@ -119,43 +129,86 @@ def register(
         The reconstruction with the most registered views of those that were accepted, or of all
         where none was; the earlier one of two with equally many.
     """
-    best: tuple[sfm.Reconstruction, str, SfmConf] | None = None
+    best: tuple[sfm.Reconstruction, str, Attempt] | None = None
     reports: list[dict[str, Any]] = []
-    any_smaller = any(
-        photos.size(_kind(i, degraded), i) != photo.sfm for i, photo in enumerate(photos.all)
-    )
     folders: dict[tuple[object, ...], Path] = {}
-    for attempt in sfm_attempts(conf, len(photos), any_smaller=any_smaller):
+
+    def run(attempt: Attempt) -> tuple[sfm.Reconstruction, str, Attempt]:
         start = time.perf_counter()
         # Attempts with the same features and matches share a folder, where COLMAP finds them.
-        folder = folders.setdefault(_features_of(attempt.conf), work / f"sfm-{attempt.name}")
-        model = _reconstruct(photos, degraded, attempt.conf, folder)
+        folder = folders.setdefault(_features_of(attempt), work / f"sfm-{attempt.name}")
+        model = _reconstruct(photos, degraded, attempt, folder)
         reason = refusal(model)
         seconds = round(time.perf_counter() - start, 1)
         results = {key: model.report[key] for key in _ATTEMPT_KEYS if key in model.report}
         reports.append({"attempt": attempt.name, "refused": reason, "seconds": seconds} | results)
-        if best is None or _rank(model, reason) > _rank(*best[:2]):
-            best = model, reason, attempt.conf
         if reason:
             _log.warning("SfM attempt %s: %s", attempt.name, reason)
+        return model, reason, attempt
+
+    for attempt in _attempts(photos, degraded, conf):
+        found = run(attempt)
+        if best is None or _rank(*found[:2]) > _rank(*best[:2]):
+            best = found
         if not best[1] and (len(best[0].viewmats) == len(photos) or len(reports) > 1):
             break
     if best is None:
         raise RuntimeError("there is always a first attempt")
-    return Registration(*best, reports)
+    if best[0].apart and conf.camera == "auto":
+        found = run(replace(best[2], name="cameras_apart", apart=best[0].apart))
+        if (*_rank(*found[:2]), -_error(found[0])) > (*_rank(*best[:2]), -_error(best[0])):
+            best = found
+    model, reason, attempt = best
+    notes = [*model.report.get("notes", ()), *_notes(attempt, photos)]
+    model = replace(model, report=model.report | {"notes": notes})
+    return Registration(model, reason, attempt, reports)
+
+
+def _error(model: sfm.Reconstruction) -> float:
+    return float(model.report.get("reprojection_error_px", math.inf))
+
+
+def _notes(attempt: Attempt, photos: PhotoCollection) -> Iterator[str]:
+    """Say what an attempt did otherwise than EXIF says."""
+    if not attempt.uses_exif:
+        focals = sorted({photo.focal_35mm for photo in photos.all if photo.focal_35mm})
+        shown = ", ".join(f"{focal:g}" for focal in focals)
+        yield (
+            f"the focal length in EXIF ({shown} mm of 35 mm film) was not used, since SfM failed"
+            " with it: it may be wrong"
+        )
+    if attempt.apart:
+        names = listed([photos.names[i] for i in sorted(attempt.apart)])
+        yield (
+            f"cropped or zoomed, though EXIF does not say so: {names} fit with another focal length"
+            " than the others of their camera, and have a camera of their own"
+        )
+
+
+def _attempts(
+    photos: PhotoCollection, degraded: Collection[int], conf: SfmConf
+) -> Iterator[Attempt]:
+    any_smaller = any(
+        photos.size(_kind(i, degraded), i) != photo.sfm for i, photo in enumerate(photos.all)
+    )
+    any_focal = any(photo.focal_35mm and photo.K is None for photo in photos.all)
+    yield from sfm_attempts(conf, len(photos), any_smaller=any_smaller, any_focal=any_focal)
 
 
 def _rank(model: sfm.Reconstruction, refused: str) -> tuple[bool, int]:
     return not refused, len(model.viewmats)
 
 
-def sfm_attempts(conf: SfmConf, images: int, *, any_smaller: bool) -> Iterator[Attempt]:
+def sfm_attempts(
+    conf: SfmConf, images: int, *, any_smaller: bool, any_focal: bool = False
+) -> Iterator[Attempt]:
     """Yield the attempts to run SfM, in order.
 
     Args:
         conf: The settings of the first attempt; `fallbacks` says whether there are others.
         images: The number of images.
         any_smaller: Whether any image is smaller than its HR view.
+        any_focal: Whether EXIF gives the focal length of any image.
     """
     attempt = Attempt("configured", conf)
     yield attempt
@@ -164,15 +217,19 @@ def sfm_attempts(conf: SfmConf, images: int, *, any_smaller: bool) -> Iterator[A
         if following is not None:
             attempt = following
             yield attempt
+        if fallback is FALLBACKS[0] and any_focal:
+            yield Attempt("without_exif", conf, uses_exif=False)
 
 
-def _features_of(conf: SfmConf) -> tuple[object, ...]:
-    """Return the settings that decide features and matches."""
-    return conf.lr_images, conf.max_num_features, conf.first_octave
+def _features_of(attempt: Attempt) -> tuple[object, ...]:
+    """Return what decides features, matches and the cameras that they begin with."""
+    conf = attempt.conf
+    settings = conf.lr_images, conf.max_num_features, conf.first_octave
+    return *settings, attempt.uses_exif, tuple(attempt.apart.items())
 
 
 def sfm_images(
-    photos: PhotoCollection, degraded: Collection[int], conf: SfmConf
+    photos: PhotoCollection, degraded: Collection[int], attempt: Attempt
 ) -> list[sfm.SfmImage]:
     """Return the image of each photograph for SfM, with the intrinsics that are known.
 
@@ -180,18 +237,21 @@ def sfm_images(
         photos: The photographs, with their `sfm` copies, and `sfm_lr` copies of the degraded ones;
             upsampled copies are made where they are needed.
         degraded: Indices of the views that SfM gets degraded.
-        conf: The settings; `lr_images` says how smaller images are given.
+        attempt: Its settings say how smaller images are given.
     """
     result = []
     for i, photo in enumerate(photos.all):
         kind = _kind(i, degraded)
-        if conf.lr_images == "upsampled":
+        if attempt.conf.lr_images == "upsampled":
             kind = photos.upsampled(kind, i)
         width, height = photos.size(kind, i)
         lens = photo.lens and photo.lens.resized(width, height)
-        focal = photo.focal_35mm and photo.focal_35mm * math.hypot(width, height) / _FILM_DIAGONAL
+        focal_35mm = photo.focal_35mm if attempt.uses_exif and i not in attempt.apart else None
+        focal = focal_35mm and focal_35mm * math.hypot(width, height) / _FILM_DIAGONAL
         # Where the intrinsics are known, each image has a camera of its own, with its own K.
         camera = photo.name if lens else f"{photo.camera} {width}x{height}"
+        if i in attempt.apart:
+            camera += f" {attempt.apart[i]}"
         file, K = photos.file(kind, i), lens.K if lens else None
         masked = copy_mask(photos.folder, file).exists()
         result.append(sfm.SfmImage(file, photo.name, camera, K, focal, masked))
@@ -203,17 +263,18 @@ def _kind(index: int, degraded: Collection[int]) -> str:
 
 
 def _reconstruct(
-    photos: PhotoCollection, degraded: Collection[int], conf: SfmConf, work: Path
+    photos: PhotoCollection, degraded: Collection[int], attempt: Attempt, work: Path
 ) -> sfm.Reconstruction:
     """Run SfM once; the cameras of the result are the HR views'."""
     work.mkdir(exist_ok=True)
-    model = sfm.reconstruct(sfm_images(photos, degraded, conf), photos.folder, work, conf)
+    given = sfm_images(photos, degraded, attempt)
+    model = sfm.reconstruct(given, photos.folder, work, attempt.conf)
     lenses = {i: photos[i].to_hr(lens) for i, lens in model.lenses.items()}
     return replace(model, lenses=lenses)
 
 
 def reconstruct_undegraded(
-    photos: PhotoCollection, conf: SfmConf, work: Path
+    photos: PhotoCollection, attempt: Attempt, work: Path
 ) -> sfm.Reconstruction:
-    """Run SfM once on the undegraded photographs."""
-    return _reconstruct(photos, (), conf, work / "sfm-reference")
+    """Run SfM once on the undegraded photographs, as in an attempt."""
+    return _reconstruct(photos, (), attempt, work / "sfm-reference")

@@ -8,7 +8,7 @@ from __future__ import annotations
 import tempfile
 import zlib  # noqa: F401  pycolmap 4.2.1 corrupts the heap where it is imported before zlib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from xrgs.capture import images
 from xrgs.capture.lens import Lens, lens_of_model
 from xrgs.capture.masks import MASKS
+from xrgs.capture.own_cameras import other_cameras
 from xrgs.runtime.machine import usable_cores
 from xrgs.runtime.progress import ProgressBar
 from xrgs.runtime.text import listed
@@ -77,6 +78,11 @@ class Reconstruction:
     """Indices of the points that were found in each image, ascending."""
     report: dict[str, Any]
     """Settings and results, by the keys that the variant's report has."""
+    world: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
+    """The rigid transform [4, 4] from the world of given poses to this one."""
+    apart: Mapping[int, int] = field(default_factory=dict)
+    """The images that fit better with another camera than the one that they share, as
+    `xrgs.capture.own_cameras` numbers them."""
 
 
 def features_per_image(images: int, configured: int) -> int:
@@ -147,7 +153,9 @@ def reconstruct(
     bogus = bogus_cameras(largest, sfm_images)
     report["notes"] = list(_notes(sfm_images, bogus))
     index = {image.file: i for i, image in enumerate(sfm_images) if i not in bogus}
-    return to_numpy(largest, index, report)
+    refined = {s.file: (i, s.camera) for i, s in enumerate(sfm_images) if s.K is None}
+    apart = other_cameras(largest, refined)
+    return replace(to_numpy(largest, index, report), apart=apart)
 
 
 def _notes(sfm_images: Sequence[SfmImage], bogus: Mapping[int, str]) -> Iterator[str]:

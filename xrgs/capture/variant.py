@@ -40,11 +40,13 @@ CORE = (
     "capture/alignment.py",
     "capture/colour.py",
     "capture/deep.py",
+    "capture/exif.py",
     "capture/frozen.py",
     "capture/images.py",
     "capture/lens.py",
     "capture/masks.py",
     "capture/mixing.py",
+    "capture/own_cameras.py",
     "capture/photographs.py",
     "capture/registration.py",
     "capture/sampling.py",
@@ -57,10 +59,13 @@ CORE = (
 #: The source files that read given poses.
 POSES = (
     "capture/colmap.py",
+    "capture/foreign.py",
     "capture/poses/__init__.py",
+    "capture/poses/checks.py",
     "capture/poses/colmap.py",
     "capture/poses/given.py",
     "capture/poses/transforms.py",
+    "capture/poses/world.py",
     "capture/triangulation.py",
 )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -76,3 +76,5 @@ class Variant:
     """Their colours [P, 3]."""
     report: dict[str, Any]
     """How SfM went: registered views, points, reprojection error, every attempt."""
+    world: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
+    """The rigid transform [4, 4] from the world of given poses to the world of views and points."""

@@ -145,7 +145,7 @@ def _shown(cell: CellFolder) -> Gaussians:
 
 
 def transform(variant: Variant) -> NDArray[np.float64]:
-    """Compute the similarity from the world of SfM to the normalised world of training.
+    """Compute the similarity from the world of SfM, or of given poses, to the world of training.
 
     Returns:
         [4, 4]; the upper left [3, 3] is a rotation times the scale.
@@ -153,7 +153,7 @@ def transform(variant: Variant) -> NDArray[np.float64]:
     from xrgs.splat.normalize import normalize_scene
 
     posed = [view.viewmat for view in variant.views if view.split != "original"]
-    return normalize_scene(np.stack(posed), variant.points).transform
+    return normalize_scene(np.stack(posed), variant.points).transform @ variant.world
 
 
 def _cell(folder: Path) -> CellFolder | None:

@@ -244,16 +244,41 @@ def test_of_several_models_the_one_of_most_images_is_taken(
     assert [file.parent for file in colmap.files(tmp_path)] == [folder / "1"] * 3
 
 
-def test_binary_files_are_preferred_and_a_model_needs_all_three(tmp_path: Path) -> None:
+def test_binary_files_are_preferred_and_a_model_may_have_no_points(tmp_path: Path) -> None:
     folder = write_colmap(tmp_path / "a", text=True)
-    assert [file.name for file in colmap.files(folder)] == [
-        "cameras.txt",
-        "images.txt",
-        "points3D.txt",
-    ]
+    text = ["cameras.txt", "images.txt", "points3D.txt"]
+    assert [file.name for file in colmap.files(folder)] == text
     for file in write_colmap(tmp_path / "b").iterdir():
         file.rename(folder / file.name)
     assert {file.suffix for file in colmap.files(folder)} == {".bin"}
     (folder / "points3D.bin").unlink()
+    assert [file.name for file in colmap.files(folder)] == text
     (folder / "images.txt").unlink()
+    assert [file.name for file in colmap.files(folder)] == ["cameras.bin", "images.bin"]
+    assert len(colmap.read(folder).points) == 0
+    (folder / "images.bin").unlink()
     assert colmap.files(folder) == []
+
+
+@pytest.mark.parametrize("start", ["scan_", "My Project - "])
+@pytest.mark.parametrize("text", [True, False])
+def test_the_names_of_a_model_may_begin_with_that_of_the_project(
+    tmp_path: Path, start: str, text: bool
+) -> None:
+    folder = write_colmap(tmp_path / "a", text=text)
+    plain = colmap.read(folder)
+    for file in list(folder.iterdir()):
+        file.rename(folder / f"{start}{file.name.replace('3D', '3d')}")
+    found = colmap.read(folder)
+    assert list(found.names) == list(plain.names)
+    assert np.array_equal(found.points, plain.points)
+
+
+def test_points_beside_a_model_may_be_in_a_ply(tmp_path: Path) -> None:
+    folder = write_colmap(tmp_path / "a")
+    plain = colmap.read(folder)
+    pycolmap.Reconstruction(folder).export_PLY(folder / "points3D.ply")
+    (folder / "points3D.bin").unlink()
+    found = colmap.read(folder)
+    assert np.allclose(np.sort(found.points, axis=0), np.sort(plain.points, axis=0), atol=1e-6)
+    assert not any(len(indices) for indices in found.observed.values())

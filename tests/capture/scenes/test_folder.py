@@ -7,6 +7,7 @@ import stat
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
 
@@ -235,3 +236,121 @@ def test_heic_is_listed_and_needs_its_package(
     monkeypatch.setattr(scenes_folder, "find_spec", lambda _: None)
     with pytest.raises(XrgsError, match=r"b\.HEIC: 1 of 2 .*pip install 'xrgs\[heic\]'"):
         scenes.names(conf)
+
+
+SAVED = {
+    **dict.fromkeys((".jpe", ".jfif", ".JPG", ".JPE", ".jpg_large", "", ".bak"), "JPEG"),
+    **dict.fromkeys((".ppm", ".pgm", ".pnm"), "PPM"),
+    **dict.fromkeys((".bmp", ".dib"), "BMP"),
+    **dict.fromkeys((".tga", ".TGA"), "TGA"),
+    ".mpo": "MPO",
+    ".jp2": "JPEG2000",
+    ".avif": "AVIF",
+    ".webp": "WEBP",
+    ".apng": "PNG",
+    ".TIFF": "TIFF",
+}
+
+
+@pytest.mark.parametrize("suffix", SAVED)
+def test_photographs_of_any_suffix_that_pillow_opens_are_taken(
+    fill: Fill, tmp_path: Path, suffix: str
+) -> None:
+    fill(tmp_path, "a.jpg", "b.jpg")
+    mode = "L" if suffix == ".pgm" else "RGB"
+    photograph = Image.linear_gradient("L").convert(mode).resize((40, 30))
+    photograph.save(tmp_path / f"IMG_1{suffix}", SAVED[suffix])
+    found = scenes_folder.look(str(tmp_path), 0)
+    assert [*found.files] == ["IMG_1", "a", "b"]
+    rare = suffix.lower() not in images.USUAL_SUFFIXES
+    said = f"taken as photographs by what is in the files: IMG_1{suffix}"
+    assert found.notes == ((said,) if rare else ())
+    scene = scenes.resolve(scene_of(tmp_path), tmp_path / "cache")
+    shown = images.read(scene.files["IMG_1"])
+    truth = np.asarray(photograph.convert("RGB")) / 255
+    assert np.abs(shown - truth).max() < 0.06  # JPEG and AVIF lose a little
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+def test_a_grey_map_of_16_bits_is_not_cut(tmp_path: Path, bits: int) -> None:
+    most = (1 << bits) - 1
+    values = np.linspace(0, most, 12).round().astype(">u2" if bits == 16 else "u1")
+    (tmp_path / "a.pgm").write_bytes(b"P5 4 3 %d\n" % most + values.tobytes())
+    truth = values.reshape(3, 4, 1).astype(np.float64) / most
+    assert np.abs(images.read(tmp_path / "a.pgm") - truth).max() < 1e-6
+    assert images.header(tmp_path / "a.pgm").bits == bits
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        *((f"IMG_1{suffix}", b"content") for suffix in (".gif", ".iiq", ".thm", ".exr", ".insp")),
+        ("IMG_1", b"GIF89a" + bytes(20)),
+        ("IMG_1.raw16", b"II*\0" + bytes(20)),
+    ],
+)
+def test_images_that_are_not_read_are_named(
+    fill: Fill, tmp_path: Path, name: str, content: bytes
+) -> None:
+    fill(tmp_path, "a.jpg", "b.jpg")
+    (tmp_path / name).write_bytes(content)
+    (tmp_path / "notes.txt").write_text("no image")
+    (tmp_path / "README").write_text("no image")
+    found = scenes_folder.look(str(tmp_path), 0)
+    assert [*found.files] == ["a", "b"]
+    why = f"images left out: 1 of a format that is not read ({name}); convert them to PNG or JPEG"
+    assert found.notes == (why,)
+
+
+@pytest.mark.parametrize(
+    ("name", "what"),
+    [
+        ("a.zip", "an archive (.zip), not a folder; unpack it"),
+        ("a.TAR", "an archive (.tar), not a folder; unpack it"),
+        ("a.mp4", "a video, not a folder; scene=video takes its frames"),
+        ("a.out", "a file of Bundler, not a folder; give the folder that the photographs are in"),
+        (
+            "a.xml",
+            "as Metashape's cameras are, not a folder; give the folder that the photographs are in",
+        ),
+    ],
+)
+def test_a_file_in_place_of_the_folder_is_named(tmp_path: Path, name: str, what: str) -> None:
+    (tmp_path / name).write_bytes(b"content")
+    with pytest.raises(XrgsError) as caught:
+        scenes_folder.look(str(tmp_path / name), 0)
+    assert what in str(caught.value)
+
+
+def test_an_archive_among_photographs_is_named(fill: Fill, tmp_path: Path) -> None:
+    fill(tmp_path, "a.jpg", "b.jpg")
+    (tmp_path / "more.zip").write_bytes(b"content")
+    notes = scenes_folder.look(str(tmp_path), 0).notes
+    assert notes == ("archives, which are not looked into; unpack them: more.zip",)
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        *("{}_mask.png", "{}.mask.jpg", "{}.jpg.mask.png", "{}_mask_0.png", "mask_{}.png"),
+        *("{}-seg.png", "{}_MASK.PNG", "{}.png", "{}_sam.png", "person_{}.png", "{}.alpha.tif"),
+    ],
+)
+def test_masks_of_other_programs_beside_photographs_are_no_photographs(
+    fill: Fill, tmp_path: Path, form: str
+) -> None:
+    fill(tmp_path, "IMG_1.jpg", "IMG_2.jpg", "IMG_3.jpg")
+    mask = Image.fromarray(np.uint8(255 * (np.indices((30, 40)).sum(0) > 30)))
+    for name in ("IMG_1", "IMG_2"):
+        mask.save(tmp_path / form.format(name))
+    found = scenes_folder.look(str(tmp_path), 0)
+    assert [*found.files] == ["IMG_1", "IMG_2", "IMG_3"]
+    assert all(file.suffix == ".jpg" and "mask" not in file.name for file in found.files.values())
+    (note,) = found.notes
+    assert note.startswith("2 images left out, which are masks, depth maps or thumbnails")
+    assert form.format("IMG_1") in note
+
+
+def test_photographs_whose_names_begin_alike_are_kept(fill: Fill, tmp_path: Path) -> None:
+    fill(tmp_path, "IMG_1.jpg", "IMG_1_2.jpg", "IMG_1 (3).jpg", "a_IMG_1.jpg")
+    assert len(scenes_folder.look(str(tmp_path), 0).files) == 4

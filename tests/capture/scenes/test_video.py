@@ -12,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tests.capture.scene_confs import scene_conf
+from tests.capture.scenes.test_panoramas import sphere
 from xrgs.capture import images, scenes
 from xrgs.capture.images import ImageError
 from xrgs.capture.scenes import video
@@ -27,6 +28,7 @@ PATCHES = [(230, 30, 30), (30, 220, 40), (30, 60, 220), (200,) * 3, (240, 200, 3
 #: From linear sRGB to linear RGB of these primaries, by ITU-R BT.2087 and by CSS Color 4.
 TO_BT2020 = [[0.6274, 0.3293, 0.0433], [0.0691, 0.9195, 0.0114], [0.0164, 0.0880, 0.8956]]
 TO_P3 = [[0.8225, 0.1775, 0], [0.0332, 0.9668, 0], [0.0171, 0.0724, 0.9105]]
+TO_BT601 = [[0.9578, 0.0422, 0], [0, 1, 0], [0, -0.0119, 1.0119]]
 TO_SRGB = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
 #: The weights of red and blue in luma of BT.601, BT.709 and BT.2020.
 BT601, BT709, BT2020 = (0.299, 0.114), (0.2126, 0.0722), (0.2627, 0.0593)
@@ -85,7 +87,7 @@ def patches(to_primaries: list[list[float]], luma: tuple[float, float]) -> NDArr
     linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
     linear = linear @ np.transpose(to_primaries)
     red, green, blue = np.where(
-        linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055
+        linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0) ** (1 / 2.4) - 0.055
     ).T
     of_red, of_blue = luma
     y = of_red * red + (1 - of_red - of_blue) * green + of_blue * blue
@@ -146,7 +148,7 @@ def test_a_video_held_upright_is_turned_as_a_player_does(tmp_path: Path) -> None
     ("colours", "to_primaries", "luma"),
     [
         ((2, 2, 2), TO_SRGB, BT601),
-        ((6, 6, 6), TO_SRGB, BT601),
+        ((5, 6, 5), TO_BT601, BT601),
         ((1, 1, 1), TO_SRGB, BT709),
         ((12, 13, 1), TO_P3, BT709),
         ((9, 14, 9), TO_BT2020, BT2020),
@@ -334,3 +336,32 @@ def test_sharpness_is_that_of_the_laplacian() -> None:
 
 def test_parts_are_equal_and_the_first_of_equals_is_taken() -> None:
     assert video.sharpest([1, 1, 1, 1, 1, 2, 0], 3) == [0, 2, 5]
+
+
+def write_streams(file: Path, *pictures: NDArray[np.uint8]) -> None:
+    """Write a video of four frames without loss, with a stream of each picture."""
+    with av.open(str(file), "w") as container:
+        streams = [container.add_stream("ffv1", rate=Fraction(10)) for _ in pictures]
+        for stream, picture in zip(streams, pictures, strict=True):
+            stream.height, stream.width = picture.shape[:2]
+            stream.pix_fmt = "yuv420p"
+        for stream, picture in zip(streams, pictures, strict=True):
+            for _ in range(4):
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+            container.mux(stream.encode(None))
+
+
+def test_the_first_of_several_streams_is_taken_and_said(tmp_path: Path) -> None:
+    write_streams(tmp_path / "a.mkv", textured(200, 9), textured(60, 9))
+    scene = scenes.resolve(conf(tmp_path / "a.mkv", 2), tmp_path)
+    assert scene.notes == ("the first of the 2 video streams of a.mkv is read, and no other",)
+    brightness = images.read(scene.files["frame_0000"])[50:].mean() * 255
+    assert brightness == pytest.approx(200, abs=6)
+    write_streams(tmp_path / "b.mkv", textured(90, 0))
+    assert scenes.resolve(conf(tmp_path / "b.mkv", 2), tmp_path).notes == ()
+
+
+def test_a_video_of_all_directions_is_refused(tmp_path: Path) -> None:
+    write_streams(tmp_path / "a.mkv", sphere(1, 64))
+    with pytest.raises(ImageError, match=r"a\.mkv: its frames show all directions, 360 degrees"):
+        scenes.resolve(conf(tmp_path / "a.mkv", 2), tmp_path)

@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from xrgs.capture import images
+from xrgs.capture import foreign, images
 from xrgs.capture.lens import Lens, quarter_turn
-from xrgs.capture.poses import colmap, transforms
+from xrgs.capture.poses import checks, colmap, transforms, world
 from xrgs.capture.poses.given import MIN_POINTS
 from xrgs.errors import UnreadableError, XrgsError
 from xrgs.runtime.text import listed
@@ -27,6 +27,7 @@ from xrgs.safeio.files import is_transient
 from xrgs.safeio.hashing import file_digest
 from xrgs.safeio.paths import user_path
 from xrgs.safeio.sanitize import for_line
+from xrgs.splat.normalize import camera_positions
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -37,9 +38,6 @@ if TYPE_CHECKING:
     from xrgs.capture.scenes import Scene
     from xrgs.capture.sfm import Reconstruction
 
-#: The largest difference of the aspect ratios of an image and its photograph, which rounding of
-#: their sides to whole px explains.
-_MAX_ASPECT = 0.01
 #: The clockwise quarters that EXIF's orientation turns stored pixels by; the others mirror them.
 _QUARTERS = {1: 0, 3: 2, 6: 1, 8: 3}
 #: A photograph of which undistortion keeps less is named.
@@ -84,14 +82,16 @@ def _source(path: str) -> Path | list[Path]:
     if not root.exists():
         raise XrgsError("no such folder or file")
     if not root.is_dir():
+        foreign.check_file(root)
         return [root]
     if parts := transforms.in_folder(root):
         return parts
     if colmap.files(root):
         return root
     raise XrgsError(
-        "it must have a transforms.json, or cameras, images and points3D, all .bin or all .txt; "
-        "COLMAP's folder is often called sparse/0"
+        "it must have a transforms.json, or cameras, images and points3D (which may be missing), "
+        "all .bin or all .txt; COLMAP's folder is often called sparse/0"
+        f"{foreign.in_folder(root)}"
     )
 
 
@@ -147,26 +147,51 @@ def read_poses(path: str, photos: PhotoCollection) -> Reconstruction:
         turned = _turned_by_exif({i: lens for i, (lens, _) in cameras.items()}, photos)
         cameras |= {i: _upright(*cameras[i], photos[i]) for i in turned}
         for i, (lens, _) in cameras.items():
-            _check_shape(lens, photos[i])
+            checks.check_camera(lens, photos[i])
+        given_lenses = {i: lens for i, (lens, _) in cameras.items()}
+        names_of = {i: name for name, i in found.items()}
+        in_folder += checks.of_other_pictures(given_lenses, names_of, photos, user_path(path))
+        viewmats, moved = world.own_world({i: viewmat for i, (_, viewmat) in cameras.items()})
+        points, rounded = _moved_points(points, viewmats, moved)
         lenses = {i: photos[i].to_hr(lens) for i, (lens, _) in cameras.items()}
         kept = {i: lens.kept() for i, lens in lenses.items()}
     notes = _notes(given.names, found, photos, lenses, kept, turned)
     none = np.zeros(0, np.intp)
     return Reconstruction(
         lenses,
-        {i: viewmat for i, (_, viewmat) in cameras.items()},
+        viewmats,
         points,
-        given.colors,
-        {i: given.observed.get(name, none) for name, i in found.items()},
+        given.colors[: len(points)],
+        {i: none if rounded else given.observed.get(name, none) for name, i in found.items()},
         {
             "poses": content,
             "images": len(photos),
             "registered": len(lenses),
             "points": len(points),
             **given.report,
-            "notes": [for_line(note) for note in (*in_folder, *given.notes, *notes)],
+            "notes": [for_line(note) for note in (*in_folder, *given.notes, *rounded, *notes)],
         },
+        moved,
     )
+
+
+def _moved_points(
+    points: NDArray[np.float64],
+    viewmats: Mapping[int, NDArray[np.float64]],
+    to: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], list[str]]:
+    """Move points to the world of the cameras; drop those that are rounded too much, and say so."""
+    own, notes = world.moved_points(points, to), []
+    if step := world.rounding(points, own):
+        far = float(np.abs(points).max())
+        notes.append(
+            f"the points of variant.poses are not used: 32 bits round them to steps of {step:.2g}, "
+            f"since they are {far:.2g} from the origin; save them in 64 bits (double)"
+        )
+        own = own[:0]
+    centres = camera_positions(np.stack([*viewmats.values()]))
+    checks.check_places(centres, own, float(np.linalg.norm(to[:3, 3])))
+    return own, notes
 
 
 def _stored(photo: Photograph) -> tuple[int, int]:
@@ -185,15 +210,11 @@ def _turned_by_exif(lenses: Mapping[int, Lens], photos: PhotoCollection) -> set[
     stored, upright, either = set[int](), set[int](), set[int]()
     for i, lens in lenses.items():
         shape, photo = (lens.width, lens.height), photos[i]
-        if photo.orientation != 1 and _same_shape(shape, _stored(photo)):
-            (either if _same_shape(shape, photo.size) else stored).add(i)
+        if photo.orientation != 1 and checks.same_shape(shape, _stored(photo)):
+            (either if checks.same_shape(shape, photo.size) else stored).add(i)
         elif photo.orientation != 1:
             upright.add(i)
     return stored if upright and not stored else stored | either
-
-
-def _same_shape(a: tuple[int, int], b: tuple[int, int]) -> bool:
-    return abs(a[0] * b[1] / (a[1] * b[0]) - 1) <= _MAX_ASPECT
 
 
 def _upright(
@@ -209,14 +230,6 @@ def _upright(
     turn = np.eye(4)
     turn[:2, :2] = quarter_turn(quarters)
     return lens.turned(quarters), turn @ viewmat
-
-
-def _check_shape(lens: Lens, photo: Photograph) -> None:
-    if not _same_shape((lens.width, lens.height), photo.size):
-        raise XrgsError(
-            f"the camera of {photo.name} is for images of {lens.width}x{lens.height} px, and the "
-            f"photograph has {photo.size[0]}x{photo.size[1]}: these are not the same picture"
-        )
 
 
 def _notes(

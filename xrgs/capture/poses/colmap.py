@@ -7,6 +7,7 @@ comes from a rig, so that `rigs` and `frames` are not needed.
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -23,7 +24,8 @@ from xrgs.runtime.text import listed
 from xrgs.safeio.files import list_names
 from xrgs.safeio.records import read_file
 
-_FILES = ("cameras", "images", "points3D")
+#: The files of a model, whose names some programs begin with that of the project.
+_NAME = re.compile(r"(.*?)(cameras|images|points3d)\.(bin|txt|ply)", re.IGNORECASE)
 #: The largest file that is read, in bytes: a model of ten thousand images has a few GB.
 _MAX_BYTES = 1 << 34
 #: The number of a point that an image's feature does not belong to: -1 of an unsigned integer.
@@ -65,7 +67,7 @@ def files(root: Path) -> list[Path]:
     """Return the files of the model in or below a folder: of several, the one of most images.
 
     Returns:
-        cameras, images and points3D; nothing where there is no model.
+        cameras, images and points3D, which may be missing; nothing where there is no model.
 
     Raises:
         OSError: A folder can't be read.
@@ -83,7 +85,7 @@ def read(root: Path) -> GivenPoses:
         XrgsError: A file is malformed; the message names it.
     """
     models = _models(root)
-    cameras_file, images_file, points_file = models[0]
+    cameras_file, images_file, *points_file = models[0]
     binary = cameras_file.suffix == ".bin"
     cameras = (_binary_cameras if binary else _text_cameras)(cameras_file)
     images: dict[str, _Image] = {}
@@ -92,7 +94,7 @@ def read(root: Path) -> GivenPoses:
             both = f"{images[image.name].number} and {image.number}"
             raise XrgsError(f"{images_file}: the images {both} have one name, {image.name}")
         images[image.name] = image
-    points = (_binary_points if binary else _text_points)(points_file)
+    points = _points(*points_file)
     order = np.argsort(points.numbers, kind="stable")
     numbers = points.numbers[order]
 
@@ -120,6 +122,20 @@ def read(root: Path) -> GivenPoses:
     )
 
 
+def _points(file: Path | None = None) -> _Points:
+    """Read the points of a model; those of a .ply have no number, and are in no image."""
+    from xrgs.capture.colmap import read_points
+
+    if file is not None and file.suffix == ".bin":
+        return _binary_points(file)
+    if file is not None and file.suffix == ".txt":
+        return _text_points(file)
+    xyz, colors = (
+        (np.zeros((0, 3)), np.zeros((0, 3), np.uint8)) if file is None else read_points(file)
+    )
+    return _Points(np.full(len(xyz), _NO_POINT), xyz, colors, np.full(len(xyz), -1.0))
+
+
 def _notes(root: Path, models: Sequence[Sequence[Path]]) -> list[str]:
     if len(models) < 2:
         return []
@@ -142,11 +158,24 @@ def _models(root: Path) -> list[list[Path]]:
 
 
 def _complete(folder: Path) -> list[Path] | None:
-    for suffix in (".bin", ".txt"):  # COLMAP prefers the binary files, too
-        files = [folder / f"{name}{suffix}" for name in _FILES]
-        if all(file.exists() for file in files):
-            return files
-    return None
+    """Return cameras, images and, where there are any, points of the model in a folder.
+
+    Points may be in a .ply, where the model has none. Of several models, one with points is taken,
+    and of these one whose names have no beginning of their own, or the first.
+    """
+    found: dict[tuple[str, str, str], Path] = {}
+    for name in list_names(folder):
+        if (match := _NAME.fullmatch(name)) and (folder / name).is_file():
+            start, part, suffix = match.groups()
+            found[start, part.lower(), suffix.lower()] = folder / name
+    models = []
+    for suffix in ("bin", "txt"):  # COLMAP prefers the binary files, too
+        for start in sorted({start for start, _, _ in found}):
+            files = [found.get((start, part, suffix)) for part in ("cameras", "images")]
+            points = found.get((start, "points3d", suffix)) or found.get((start, "points3d", "ply"))
+            if all(files):
+                models.append([file for file in (*files, points) if file is not None])
+    return max(models, key=len, default=None)
 
 
 def _count_images(file: Path) -> int:

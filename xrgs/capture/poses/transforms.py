@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from xrgs.capture import foreign
 from xrgs.capture.lens import MODELS, Lens, lens_of_model
 from xrgs.capture.poses.given import GivenPoses
 from xrgs.errors import StoreError, UnreadableError, XrgsError
@@ -26,6 +27,8 @@ _MAX_BYTES = 1 << 26
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 #: How far the columns of a rotation may be from orthogonal and equally long, for rounded digits.
 _MAX_SKEW = 0.01
+#: How far the last row of a matrix may be from 0, 0, 0, 1.
+_MAX_LAST_ROW = 1e-6
 #: The keys that give a focal length; a frame that has one has none of the whole file.
 _FOCAL = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov")
 #: Names of models that OpenCV's terms describe, whichever of them the file has.
@@ -135,7 +138,8 @@ def _content(file: Path) -> dict[str, Any]:
         and PurePosixPath(frame["file_path"]).name
         for frame in frames
     ):
-        raise XrgsError(f"{file}: not a transforms.json: each of its frames must have a file_path")
+        why = foreign.of_json(content) or ": each of its frames must have a file_path"
+        raise XrgsError(f"{file}: not a transforms.json{why}")
     return content
 
 
@@ -227,7 +231,11 @@ def _focal(entry: Mapping[str, Any], axis: str, side: int) -> float | None:
     angle = entry.get(f"camera_angle_{axis}")
     if angle is None and entry.get(f"{axis}_fov") is not None:  # of instant-ngp, in degrees
         angle = math.radians(as_number(entry[f"{axis}_fov"]))
-    return None if angle is None else side / 2 / math.tan(as_number(angle) / 2)
+    if angle is None:
+        return None
+    if not 0 < as_number(angle) < math.pi:
+        raise ValueError(f"camera_angle_{axis}={angle} must be between 0 and pi, in radians")
+    return side / 2 / math.tan(as_number(angle) / 2)
 
 
 def _viewmat(rows: object) -> NDArray[np.float64]:
@@ -235,6 +243,10 @@ def _viewmat(rows: object) -> NDArray[np.float64]:
     matrix = np.array(rows, dtype=np.float64)
     if matrix.shape not in {(4, 4), (3, 4)} or not np.isfinite(matrix).all():
         raise ValueError("transform_matrix must be 4 x 4 finite numbers")
+    if len(matrix) == 4 and np.abs(matrix[3] - (0, 0, 0, 1)).max() > _MAX_LAST_ROW:
+        raise ValueError(
+            "transform_matrix must be of rows, the last of them 0, 0, 0, 1; is it of columns?"
+        )
     # Rounded digits make a rotation that is not quite one: the nearest rotation is taken. A scale
     # of the camera's own axes changes no projection.
     U, stretch, Vt = np.linalg.svd(matrix[:3, :3])

@@ -17,15 +17,14 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
-from itertools import chain
 from pathlib import Path
-from statistics import median
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from xrgs.capture import images
-from xrgs.capture.scenes.copies import SIZES, one_of_each_size, size, without_copies
+from xrgs.capture import foreign, images
+from xrgs.capture.masks import WORDS
+from xrgs.capture.scenes.copies import SIZES, one_of_each_size, without_copies
+from xrgs.capture.scenes.made import is_mask, without_made
+from xrgs.capture.scenes.panoramas import without_panoramas
 from xrgs.capture.scenes.scene import ALL_BELOW, Scene, files_digest, label, remembered
 from xrgs.errors import UnreadableError, XrgsError
 from xrgs.runtime.text import listed
@@ -38,13 +37,21 @@ if TYPE_CHECKING:
 
     from xrgs.config import SceneConf
 
-#: Those of images that are not read: raw files, and formats that no camera of today writes.
+#: Those of images that are not read: raw files, stereo pairs and pictures of two fisheye lenses in
+#: one file, thumbnails, and formats that no camera of today writes.
 _OTHER_IMAGES = frozenset(
-    {".3fr", ".arw", ".cr2", ".cr3", ".dng", ".nef", ".nrw", ".orf", ".pef", ".raf", ".rw2"}
-    | {".srw", ".x3f", ".avif", ".exr", ".gif", ".hdr", ".insp", ".jfif", ".jp2", ".jxl", ".psd"}
+    {".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dcr", ".dng", ".erf", ".fff", ".gpr", ".iiq", ".kdc"}
+    | {".mef", ".mos", ".mrw", ".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl"}
+    | {".sr2", ".srw", ".x3f", ".dds", ".exr", ".fits", ".gif", ".hdr", ".heics", ".ico", ".insp"}
+    | {".jps", ".jxl", ".jxr", ".pcx", ".pfm", ".psb", ".psd", ".qoi", ".sgi", ".svg", ".thm"}
+    | {".wdp", ".xcf"}
 )
 #: Suffixes of videos.
-VIDEOS = frozenset({".3gp", ".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpg", ".mts", ".webm"})
+VIDEOS = frozenset(
+    {".360", ".3gp", ".avi", ".flv", ".insv", ".lrv", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4"}
+    | {".mpeg", ".mpg", ".mts", ".ogv", ".webm", ".wmv"}
+)
+_ARCHIVES = frozenset({".7z", ".gz", ".rar", ".tar", ".tgz", ".xz", ".zip"})
 #: What programs make around photographs, by the entries of the folder that tell it.
 _MADE = {
     "a store of xrgs": ("cells", "variants"),
@@ -60,25 +67,16 @@ _UNDISTORTED = "copies that COLMAP undistorted"
 _OF_SYSTEM = frozenset(
     {"#recycle", "$recycle.bin", "@eadir", "__macosx", "lost+found", "system volume information"}
 )
-_MASK = r"masks?|segmentations?|seg|segments|mattes?|silhouettes?"
 #: The names of folders of masks, and of other images that programs make of photographs.
-_OF_MASKS = re.compile(rf"(?:.*[\W_])?(?:{_MASK})(?:[\W_\d].*)?", re.IGNORECASE)
+_OF_MASKS = re.compile(rf"(?:.*[\W_])?(?:{WORDS})(?:[\W_\d].*)?", re.IGNORECASE)
 _OF_OTHERS = re.compile(
     r"(?:.*[\W_])?(?:depths?|depth_?maps?|disparity|normals|normal_?maps?|thumbs?|thumbnails?)"
     r"(?:[\W_\d].*)?",
     re.IGNORECASE,
 )
-#: What a name has before or after the name of the photograph that an image was made of.
-_ADDED = rf"(?:{_MASK}|depth|disparity|normals?|thumb|thumbnail)"
-_ADDED_BEFORE, _ADDED_AFTER = re.compile(rf"^{_ADDED}[\W_]?"), re.compile(rf"[\W_]?{_ADDED}$")
 #: The deepest nesting of folders that is searched, and what is said of those below it.
 _MAX_DEPTH = 8
 _DEEP = f"nested more than {_MAX_DEPTH} folders deep; move them up"
-#: A picture that is longer for its width than this, and so many times longer than the others, is
-#: called a panorama. It would set the size of all others, and SfM can't place it. Our choice.
-_PANORAMA, _TIMES = 2.2, 1.6
-#: The least share of the values of a mask of three channels that is 0 or 1.
-_SHARE_OF_ENDS = 0.95
 
 
 @dataclass(frozen=True)
@@ -136,26 +134,24 @@ def look(path: str | None, long_side: int, masks: str | None = None) -> Listing:
     folder, nested = user_path(path.removesuffix(ALL_BELOW)), path.endswith(ALL_BELOW)
     try:
         if not folder.is_dir():
-            why = "no such folder"
-            if folder.is_file():
-                why = "not a folder; for the frames of a video: scene=video scene.path=..."
+            why = _not_a_folder(folder) if folder.is_file() else "no such folder"
             raise XrgsError(f"scene.path={folder}: {why}")
         known = None if masks is None else user_path(masks).resolve()
         found = (_all_below if nested else _inside)(folder, long_side, known)
         listed_files = [file for inside in found.folders.values() for file in inside]
         named, unnamed = _named(listed_files, folder, nested=nested)
-        photographs, made = _photographs([*named], folder)
+        photographs, made = without_made([*named], folder)
         single, copies = without_copies(photographs, folder, found.other_sizes)
-        files, shapes = _without_panoramas(single, folder)
+        files, shapes = without_panoramas(single, folder)
         not_read = _not_read({folder, *found.folders}, files)
         grey = _grey(files, folder)
-        said = (*found.notes, *unnamed, *made, *copies, *shapes, *grey, *not_read)
+        said = (*found.notes, *unnamed, *made, *copies, *shapes, *grey, *_rare(files), *not_read)
         notes = tuple(map(for_line, said))  # names in them may be no text, which no file takes
     except OSError as error:
         raise UnreadableError(f"{error.filename}: {error.strerror}; try again") from error
     if len(files) < 2:
         count = f"only {files[0].name}" if files else "no image"
-        suffixes = " ".join(sorted(images.SUFFIXES))
+        suffixes = " ".join(sorted(images.USUAL_SUFFIXES))
         why = f"{count} in it; two or more are needed ({suffixes})"
         raise XrgsError("; ".join([f"scene.path={folder}: {why}", *notes]))
     _check_heic(files)
@@ -283,7 +279,7 @@ def _in_other_folders(folder: Path, taken: _Tree, masks: Path | None) -> list[st
         images_in = {inside: files for inside in below if (files := _images_in(inside))}
         stems = {file.stem.casefold() for files in taken.values() for file in files}
         for inside, files in images_in.items():
-            if files[0].stem.casefold() in stems and _is_mask(files[0]):
+            if files[0].stem.casefold() in stems and is_mask(files[0]):
                 passed[_MASKS].append(inside)
     except OSError as error:
         return [f"the folders below can't be searched for more images ({error})"]
@@ -313,74 +309,31 @@ def _left_out(counts: Mapping[Path, int], folder: Path, why: str) -> list[str]:
     return [f"images left out: {listed(where)} ({why})"] if where else []
 
 
-def _photographs(files: Sequence[Path], folder: Path) -> tuple[list[Path], list[str]]:
-    """Leave out images that were made of photographs, and say so; images of xrgs alone are kept."""
-    own = {file for file in files if _is_own(file)}
-    if len(own) == len(files):
-        own = set()
-    made = _made_of_others([file for file in files if file not in own])
-    notes = [
-        f"{counted(len(left), 'image')} left out, {why}: "
-        + listed([str(file.relative_to(folder)) for file in sorted(left)])
-        for left, why in (
-            (own, "which xrgs made"),
-            (made, "which are masks, depth maps or thumbnails by name or channels"),
-        )
-        if left
-    ]
-    made |= own
-    return [file for file in files if file not in made], notes
+def _not_a_folder(file: Path) -> str:
+    """Say what a file is that was given in place of a folder, and what to do."""
+    suffix = file.suffix.lower()
+    if suffix in _ARCHIVES:
+        return f"an archive ({suffix}), not a folder; unpack it, and give the folder"
+    if suffix in _VIDEOS:
+        return "a video, not a folder; scene=video takes its frames"
+    what = f"{kind}, " if (kind := foreign.kind(file)) else ""
+    return f"{what}not a folder; give the folder that the photographs are in"
 
 
-@remembered
-def _is_own(file: Path) -> bool:
-    try:
-        return file.suffix.lower() == ".png" and images.is_own(file)
-    except images.ImageError:
-        return False
-
-
-@remembered
-def _is_mask(file: Path) -> bool:
-    """Return whether an image has one channel, or hardly another value than 0 and the largest."""
-    try:
-        pixels = None if not images.has_colour(file) else images.decode(file).pixels
-    except images.ImageError:
-        return False
-    return pixels is None or bool(np.mean((pixels == 0) | (pixels == 1)) > _SHARE_OF_ENDS)
-
-
-def _made_of_others(files: Sequence[Path]) -> set[Path]:
-    """Find masks, depth maps and thumbnails by the names of their photographs.
-
-    These are `a.jpg.png` and `a_mask.png` where there is an `a.jpg`, and an image of one channel
-    or of two values where another one of the same name is a photograph. The first image of a folder
-    stands for all.
-    """
-    names = {file.name.casefold() for file in files}
-    named = defaultdict(list)
-    for file in files:
-        named[file.stem.casefold()].append(file)
-    made = set()
-    for stem, group in named.items():
-        plain = {_ADDED_BEFORE.sub("", stem), _ADDED_AFTER.sub("", stem)} - {stem}
-        if stem in names or plain & named.keys():
-            made |= {*group}
-    by_folder = defaultdict(list)
-    for file in files:
-        if len(named[file.stem.casefold()]) > 1 and file not in made:
-            by_folder[file.parent, file.suffix.lower()].append(file)
-    masks = {file for group in by_folder.values() if _is_mask(group[0]) for file in group}
-    return made if masks == {*chain(*by_folder.values())} else made | masks
+def _rare(files: Sequence[Path]) -> list[str]:
+    """Name the photographs whose suffixes are not those of photographs of today."""
+    rare = [file.name for file in files if file.suffix.lower() not in images.USUAL_SUFFIXES]
+    return [f"taken as photographs by what is in the files: {listed(rare)}"] if rare else []
 
 
 def _not_read(folders: Iterable[Path], taken: Sequence[Path]) -> list[str]:
     """Say which images and videos in folders can't be taken as they are, and what to do."""
     shown = {file.with_suffix("") for file in taken}
-    videos, others, irregular = (
+    videos, others, archives, irregular = (
         [file for folder in sorted(folders) for file in _with_suffix(folder, suffixes)]
-        for suffixes in (VIDEOS, _OTHER_IMAGES, images.SUFFIXES)
+        for suffixes in (VIDEOS, _OTHER_IMAGES, _ARCHIVES, images.SUFFIXES)
     )
+    others += [f for folder in sorted(folders) for f in _of_no_suffix(folder) if _told(f) is None]
     lines = []
     if alone := [file for file in videos if file.with_suffix("") not in shown]:
         how = f"scene=video scene.path={alone[0]} takes frames of one"
@@ -390,6 +343,9 @@ def _not_read(folders: Iterable[Path], taken: Sequence[Path]) -> list[str]:
             f"images left out: {len(alone)} of a format that is not read "
             f"({listed([file.name for file in alone])}); convert them to PNG or JPEG"
         )
+    if archives:
+        names = listed([file.name for file in archives])
+        lines.append(f"archives, which are not looked into; unpack them: {names}")
     if beside := [file for file in (*videos, *others) if file.with_suffix("") in shown]:
         names = listed([file.name for file in beside])
         lines.append(f"not read, beside photographs of the same names: {names}")
@@ -397,23 +353,6 @@ def _not_read(folders: Iterable[Path], taken: Sequence[Path]) -> list[str]:
         names = listed([file.name for file in pipes])
         lines.append(f"left out, neither regular files nor links to one (pipes?): {names}")
     return lines
-
-
-def _without_panoramas(files: Sequence[Path], folder: Path) -> tuple[list[Path], list[str]]:
-    """Leave out panoramas, which no pinhole camera took, and name other pictures of their shape."""
-    aspects = {file: max(size(file)) / min(size(file)) for file in files if min(size(file))}
-    usual = median(aspects.values()) if aspects else 1.0
-    longer = {f for f, a in aspects.items() if a > max(1.1 * usual, min(_PANORAMA, _TIMES * usual))}
-    panoramas = {f for f in longer if aspects[f] > max(_PANORAMA, _TIMES * usual)}
-    notes = [
-        f"{why}: {listed([str(file.relative_to(folder)) for file in sorted(those)])}"
-        for why, those in (
-            ("left out as panoramas, by their shape", panoramas),
-            ("longer for their width than others (screenshots, crops?)", longer - panoramas),
-        )
-        if those
-    ]
-    return [file for file in files if file not in panoramas], notes
 
 
 def _grey(files: Sequence[Path], folder: Path) -> list[str]:
@@ -481,8 +420,31 @@ def _is_size(folder: Path) -> bool:
 
 
 def _images_in(folder: Path) -> list[Path]:
-    """List the regular files that are photographs by their suffix, and the links to such files."""
-    return [file for file in _with_suffix(folder, images.SUFFIXES) if file.is_file()]
+    """List the regular files that are photographs, and the links to such files, sorted.
+
+    The suffix tells, and the first bytes of files whose suffix is no image's.
+    """
+    known = [file for file in _with_suffix(folder, images.SUFFIXES) if file.is_file()]
+    return sorted(known + [file for file in _of_no_suffix(folder) if _told(file)])
+
+
+def _of_no_suffix(folder: Path) -> list[Path]:
+    """List the regular files without a suffix of an image, a video or an archive, sorted."""
+    known = images.SUFFIXES | _OTHER_IMAGES | _VIDEOS | _ARCHIVES
+    return [
+        file
+        for file in sorted(folder.iterdir(), key=lambda file: file.name)
+        if file.suffix.lower() not in known and not file.name.startswith(".") and file.is_file()
+    ]
+
+
+@remembered
+def _told(file: Path) -> bool | None:
+    """Tell a photograph by its first bytes; a file that can't be read is none."""
+    try:
+        return images.is_photograph(file)
+    except OSError:
+        return False
 
 
 def _with_suffix(folder: Path, suffixes: frozenset[str]) -> list[Path]:

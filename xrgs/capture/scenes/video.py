@@ -12,6 +12,7 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import partial
 from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
@@ -22,6 +23,7 @@ import numpy as np
 from xrgs.capture import colour, images
 from xrgs.capture.scenes import rendered
 from xrgs.capture.scenes.deinterlace import deinterlaced
+from xrgs.capture.scenes.panoramas import is_of_all_directions
 from xrgs.capture.scenes.scene import Scene, check_views, label
 from xrgs.errors import UnreadableError, XrgsError
 from xrgs.runtime.progress import ProgressBar
@@ -34,7 +36,9 @@ from xrgs.safeio.sanitize import for_line
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+    from av.container import InputContainer
     from av.video.frame import VideoFrame
+    from av.video.stream import VideoStream
     from numpy.typing import NDArray
 
     from xrgs.config import SceneConf
@@ -95,9 +99,34 @@ class VideoScene:
 
     def resolve(self, conf: SceneConf, long_side: int, home: Path) -> Scene:
         """Extract the frames where they are not there."""
-        views = self.names(conf, long_side)
-        files = rendered.provide(home, views, lambda work: extract(_file(conf.path), views, work))
-        return Scene(label(conf), home.name, files)
+        views, file = self.names(conf, long_side), _file(conf.path)
+        files = rendered.provide(home, views, lambda work: extract(file, views, work))
+        return Scene(label(conf), home.name, files, notes=_notes(file))
+
+
+def _notes(file: Path) -> tuple[str, ...]:
+    """Say which of several streams is read, as long as the video is there."""
+    import av
+
+    try:
+        with (
+            file.open("rb") as stream,
+            av.open(stream, "r", options={"format_whitelist": _CONTAINERS}) as container,
+        ):
+            count = len(_streams(container))
+    except (av.FFmpegError, OSError):
+        return ()
+    if count < 2:
+        return ()
+    return (f"the first of the {count} video streams of {file.name} is read, and no other",)
+
+
+def _streams(container: InputContainer) -> list[VideoStream]:
+    """Return the video streams of a file, without pictures of its cover."""
+    from av.stream import Disposition
+
+    cover = Disposition.attached_pic
+    return [one for one in container.streams.video if not one.disposition & cover]
 
 
 def _file(path: str | None) -> Path:
@@ -110,7 +139,8 @@ def extract(file: Path, names: Sequence[str], folder: Path) -> None:
     """Write the sharpest frames of a video as `<name>.png` to a folder, as a player shows them.
 
     Raises:
-        ImageError: The file is not a video, it is HDR, or its frames are too large.
+        ImageError: The file is not a video, it is HDR or of 360 degrees, or its frames are too
+            large.
         XrgsError: It has fewer frames than names.
     """
     with ProgressBar("sharpness of frames", "frame", None) as bar:
@@ -126,7 +156,13 @@ def extract(file: Path, names: Sequence[str], folder: Path) -> None:
     with ProgressBar("frames", "frame", len(names)) as bar:
         for number, frame in enumerate(_frames(file)):
             if number in chosen:
-                images.save(folder / f"{chosen[number]}.png", _shown(frame), durable=False)
+                image = _shown(frame)
+                if is_of_all_directions(image.shape[1::-1], partial(images.small, image)):
+                    raise images.ImageError(
+                        f"{file}: its frames show all directions, 360 degrees, and no pinhole "
+                        "camera took them; cut them into perspective views first"
+                    )
+                images.save(folder / f"{chosen[number]}.png", image, durable=False)
                 bar.update(1)
 
 
@@ -159,9 +195,9 @@ def _frames(file: Path) -> Iterator[_Frame]:
             file.open("rb") as stream,
             av.open(stream, "r", options={"format_whitelist": _CONTAINERS}) as container,
         ):
-            if not container.streams.video:
+            if not (streams := _streams(container)):
                 raise images.ImageError(f"{file}: it has no video")
-            video = container.streams.video[0]
+            video = streams[0]
             video.thread_type = "AUTO"
             # Asked before frames are decoded: some decoders forget what the container says.
             codec, aspect = video.codec_context, video.sample_aspect_ratio or Fraction(1)

@@ -1,0 +1,71 @@
+"""Names the files of other programs that are given as poses, and says what to do with them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from xrgs.errors import XrgsError
+from xrgs.runtime.text import listed
+from xrgs.safeio.files import list_names
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+_AS_COLMAP = "export the cameras in COLMAP's format from the program that made it"
+_UNPACK = "unpack it, and give the folder"
+_FOLDER = "give the folder that it is in"
+#: What files are by the end of their names, in lower case, and what to do.
+_ENDINGS = {
+    **dict.fromkeys((".zip", ".7z", ".rar", ".tar", ".tgz", ".gz", ".xz"), ("an archive", _UNPACK)),
+    ".xml": ("an .xml file, as Metashape's cameras are", _AS_COLMAP),
+    **dict.fromkeys((".psx", ".psz"), ("a project of Metashape", _AS_COLMAP)),
+    **dict.fromkeys((".rcproj", ".rsproj"), ("a project of RealityScan", _AS_COLMAP)),
+    ".out": ("a file of Bundler", _AS_COLMAP),
+    ".nvm": ("a file of VisualSFM", _AS_COLMAP),
+    **dict.fromkeys((".sfm", ".mg"), ("a file of Meshroom", _AS_COLMAP)),
+    **dict.fromkeys((".abc", ".fbx"), ("a scene of an animation program", _AS_COLMAP)),
+    ".csv": ("a table", _AS_COLMAP),
+    ".npy": ("an array of numpy, as LLFF's poses_bounds.npy is", _AS_COLMAP),
+    ".db": ("COLMAP's database, which has no poses", "give the folder of its model, sparse/0"),
+    ".ply": ("a file of points, which has no cameras", _FOLDER),
+    **dict.fromkeys((".bin", ".txt"), ("one file", _FOLDER)),
+}
+#: Programs by a key of their .json files.
+_KEYS = {
+    "sfm_data_version": "OpenMVG",
+    "featuresFolders": "Meshroom",
+    "camera_models": "Polycam",
+    "shots": "OpenSfM",
+}
+
+
+def kind(file: Path) -> str:
+    """Say what a file is by the end of its name; empty where it may be a transforms.json."""
+    return next((w for end, (w, _) in _ENDINGS.items() if file.name.lower().endswith(end)), "")
+
+
+def check_file(file: Path) -> None:
+    """Refuse a file that is no .json.
+
+    Raises:
+        XrgsError: It is of another kind; the message names the kind, and says what to do.
+    """
+    for ending, (what, todo) in _ENDINGS.items():
+        if file.name.lower().endswith(ending):
+            raise XrgsError(
+                f"it is {what}, and not a folder of COLMAP's or a transforms.json; {todo}"
+            )
+
+
+def in_folder(folder: Path) -> str:
+    """Say which files in a folder are of other programs; empty where there are none."""
+    endings = tuple(ending for ending in _ENDINGS if ending not in (".bin", ".txt", ".ply", ".csv"))
+    found = [name for name in list_names(folder) if name.lower().endswith(endings)]
+    return f"; {listed(found)} can't be read: {_AS_COLMAP}" if found else ""
+
+
+def of_json(content: Mapping[str, Any]) -> str:
+    """Name the program that wrote a .json; empty where it is not known."""
+    programs = [program for key, program in _KEYS.items() if key in content]
+    return f": it is of {programs[0]}; {_AS_COLMAP}" if programs else ""
