@@ -314,7 +314,7 @@ def _not_a_folder(file: Path) -> str:
     suffix = file.suffix.lower()
     if suffix in _ARCHIVES:
         return f"an archive ({suffix}), not a folder; unpack it, and give the folder"
-    if suffix in _VIDEOS:
+    if suffix in VIDEOS:
         return "a video, not a folder; scene=video takes its frames"
     what = f"{kind}, " if (kind := foreign.kind(file)) else ""
     return f"{what}not a folder; give the folder that the photographs are in"
@@ -430,7 +430,7 @@ def _images_in(folder: Path) -> list[Path]:
 
 def _of_no_suffix(folder: Path) -> list[Path]:
     """List the regular files without a suffix of an image, a video or an archive, sorted."""
-    known = images.SUFFIXES | _OTHER_IMAGES | _VIDEOS | _ARCHIVES
+    known = images.SUFFIXES | _OTHER_IMAGES | VIDEOS | _ARCHIVES
     return [
         file
         for file in sorted(folder.iterdir(), key=lambda file: file.name)
