@@ -97,7 +97,8 @@ def test_gaussians_of_any_size_reach_viser(
     One guesses float32, as of the centres: Gaussians of small units would vanish in silence.
     """
     viser = pytest.importorskip("viser")
-    added, add = [], viser.SceneApi.add_gaussian_splats
+    added: list[Any] = []
+    add = viser.SceneApi.add_gaussian_splats
     monkeypatch.setattr(
         viser.SceneApi,
         "add_gaussian_splats",
