@@ -1,11 +1,14 @@
-"""The links of the documentation lead to files and headings that are there."""
+"""The links of the documentation lead somewhere, and its lists name what there is."""
 
 from __future__ import annotations
 
+import os
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[1]
 #: The target of a link or a picture; those of the web and of an address are not looked at.
@@ -15,7 +18,7 @@ _CODE = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
 
 
 def pages() -> list[Path]:
-    folders = (ROOT, ROOT / "docs", ROOT / "examples", ROOT / "reports")
+    folders = (ROOT, ROOT / "docs", ROOT / "examples", ROOT / "reports", ROOT / "findings")
     return [page for folder in folders for page in sorted(folder.glob("*.md"))]
 
 
@@ -32,3 +35,26 @@ def test_links_lead_somewhere(page: Path) -> None:
         target = page.parent / path if path else page
         assert target.exists(), link
         assert not anchor or anchor in anchors(target), link
+
+
+def test_the_findings_are_listed_and_run() -> None:
+    scripts = sorted((ROOT / "findings").glob("*.sh"))
+    listed = re.findall(
+        r"^\| \[(\w+)\]\(\1\.sh\)", (ROOT / "findings/README.md").read_text(), re.MULTILINE
+    )
+    assert listed == [script.stem for script in scripts]
+    assert all(os.access(script, os.X_OK) for script in scripts)
+
+
+def test_the_tested_versions_are_those_that_are_allowed() -> None:
+    table = re.findall(
+        r"^\| ([\w-]+) \| ([\d.]+) \| ([\d.]+) \|",
+        (ROOT / "docs/versions.md").read_text(),
+        re.MULTILINE,
+    )
+    tested = {name: versions for name, *versions in table}
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    allowed = {found.name: found.specifier for found in map(Requirement, project["dependencies"])}
+    assert tested.keys() == allowed.keys()
+    for name, versions in tested.items():
+        assert all(allowed[name].contains(version) for version in versions), name

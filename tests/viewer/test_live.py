@@ -14,11 +14,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from xrgs.errors import XrgsError
 from xrgs.viewer import live
 from xrgs.viewer.models import Model
+from xrgs.viewer.splats import to_splats
 
 MakeModel = Callable[..., Model]
 
@@ -84,6 +86,37 @@ def test_a_port_in_use_is_named(model: MakeModel) -> None:
 def test_what_is_left_out_is_said(model: MakeModel) -> None:
     assert live.count_text(model(), 40) == "40 Gaussians"
     assert live.count_text(model(), 30) == "the 30 most opaque of 40 Gaussians (--limit 30)"
+
+
+@pytest.mark.parametrize("size", [1e-5, 1.0, 1e4])
+def test_gaussians_of_any_size_reach_viser(
+    model: MakeModel, monkeypatch: pytest.MonkeyPatch, size: float
+) -> None:
+    """viser 1.1.1 sends covariances as float16 (viser/_scene_api.py, add_gaussian_splats).
+
+    One guesses float32, as of the centres: Gaussians of small units would vanish in silence.
+    """
+    viser = pytest.importorskip("viser")
+    added: list[Any] = []
+    add = viser.SceneApi.add_gaussian_splats
+    monkeypatch.setattr(
+        viser.SceneApi,
+        "add_gaussian_splats",
+        lambda *args, **options: added.append(add(*args, **options)),
+    )
+    made = model()
+    with torch.no_grad():
+        made.gaussians.means.mul_(size)
+        made.gaussians.scales.add_(np.log(size))
+    with live.shown([made], 0, 40):
+        (handle,) = added
+        sent = np.ascontiguousarray(handle.buffer)
+    expected = to_splats(made.gaussians, 40)
+    upper = expected.covariances[:, *np.triu_indices(3)]
+    covariances = sent[:, 4:7].copy().view(np.float16).astype(float) * handle.scale**2
+    largest = expected.covariances.max((1, 2))
+    assert abs(covariances - upper).max(1) / largest == pytest.approx(0, abs=1e-3)
+    assert sent[:, :3].view(np.float32) * handle.scale == pytest.approx(expected.centers, rel=1e-5)
 
 
 def test_without_viser_the_extra_is_named(without: Callable[[str], None]) -> None:

@@ -163,12 +163,16 @@ def _fill(server: ViserServer, model: Model, world: Model | None, limit: int) ->
     """Add the splats of a model, and the cameras of the world that it is in."""
     splats = to_splats(model.gaussians, limit)
     server.gui.configure_theme(control_width="small", show_share_button=False, show_logo=False)
+    # viser keeps covariances as float16, where standard deviations below 0.0002 become 0 and those
+    # above 255 infinite: in this unit the largest is 250, and 0.01 keeps its precision.
+    unit = float(np.sqrt(splats.covariances.max(initial=0))) / 250 or 1.0
     server.scene.add_gaussian_splats(
         "/splats",
-        splats.centers,
-        splats.covariances,
+        splats.centers / unit,
+        splats.covariances / unit**2,
         splats.colors,
         splats.opacities[:, None],
+        scale=unit,
     )
     server.gui.add_markdown(f"**{for_markdown(model.name)}**\n\n{count_text(model, limit)}")
     if world is not None:
