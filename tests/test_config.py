@@ -260,7 +260,7 @@ def test_configs_are_composed_where_hydra_is_in_use_and_leave_it_as_it_was(
 ) -> None:
     for kind in (VersionBase, JobRuntime):
         monkeypatch.setitem(Singleton._instances, kind, kind.__new__(kind))
-        kind.instance().__init__()
+        type(kind.instance()).__init__(kind.instance())
     (tmp_path / "mine.yaml").write_text("a: 1\n")
     with hydra.initialize_config_dir(str(tmp_path), job_name="mine", version_base="1.2"):
         assert xrgs.compose("seed=3").seed == 3
