@@ -81,7 +81,9 @@ def turn(file: Path) -> None:
     file.write_bytes(content[:at] + QUARTER_TURN + content[at + len(UPRIGHT) :])
 
 
-def patches(to_primaries: Sequence[Sequence[float]], luma: tuple[float, float]) -> NDArray[np.uint8]:
+def patches(
+    to_primaries: Sequence[Sequence[float]], luma: tuple[float, float]
+) -> NDArray[np.uint8]:
     """Stripes of `PATCHES` with sRGB's curve, as 4:2:0 of limited range [HEIGHT * 3 / 2, WIDTH]."""
     srgb = np.array(PATCHES) / 255
     linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
