@@ -17,9 +17,9 @@ import argparse
 import math
 import os
 import resource
+import shutil
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -220,22 +220,25 @@ class Race:
         photographs.parent.mkdir(parents=True, exist_ok=True)
         opensplat.write_training_views(data, photographs)
         options = (str(photographs), *options)
-        with tempfile.TemporaryDirectory(dir=folder) as out:
-            kept = opensplat.train(self.peer, options, every, list(minutes), Path(out))
-            for made, limit in {kept[limit]: limit for limit in sorted(kept)}.items():
-                gaussians = load_ply(made.file)
-                renders = folder / f"{start.arm}-{minutes[limit]:g}min" / conf.scene.name
-                scores = opensplat.score(gaussians, data.test, conf.splat, renders)
-                took = {"training_time_s": made.seconds, "gaussians": len(gaussians)}
-                write_json(renders / FIGURES, took)
-                yield {
-                    "minutes": minutes[limit],
-                    "steps": made.steps,
-                    "seconds": made.seconds,
-                    "gaussians": len(gaussians),
-                    "bytes": made.file.stat().st_size,
-                    **{name: scores[name] for name in race_table.SCORES},
-                }
+        out = folder / "running"
+        shutil.rmtree(out, ignore_errors=True)  # of a run that was stopped
+        out.mkdir()
+        kept = opensplat.train(self.peer, options, every, list(minutes), out)
+        for made, limit in {kept[limit]: limit for limit in sorted(kept)}.items():
+            gaussians = load_ply(made.file)
+            renders = folder / f"{start.arm}-{minutes[limit]:g}min" / conf.scene.name
+            scores = opensplat.score(gaussians, data.test, conf.splat, renders)
+            took = {"training_time_s": made.seconds, "gaussians": len(gaussians)}
+            write_json(renders / FIGURES, took)
+            yield {
+                "minutes": minutes[limit],
+                "steps": made.steps,
+                "seconds": made.seconds,
+                "gaussians": len(gaussians),
+                "bytes": made.file.stat().st_size,
+                **{name: scores[name] for name in race_table.SCORES},
+            }
+        shutil.rmtree(out)
 
 
 def main() -> None:
