@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from xrgs.evaluation.metrics import METRICS, ON_REQUEST, VIEW_METRICS
 from xrgs.safeio.code import code_digest
+from xrgs.safeio.refactorings import canonical
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -28,7 +29,17 @@ def scoring_code(also: frozenset[str] = frozenset()) -> dict[str, str]:
     """
     wanted = {*VIEW_METRICS, *also}
     scores = {m.name: code_digest(*m.sources) for m in METRICS if m.name in wanted}
-    return {PROTOCOL: code_digest("evaluation/protocol.py"), **scores}
+    return without_refactorings({PROTOCOL: code_digest("evaluation/protocol.py"), **scores})
+
+
+def without_refactorings(codes: Mapping[str, str]) -> dict[str, str]:
+    """Return digests of scores by name, each the oldest that is declared equal to it."""
+    return {name: canonical(part_of(name), code) for name, code in codes.items()}
+
+
+def part_of(score: str) -> str:
+    """Return the name of a score, or of the protocol, among the parts of the code."""
+    return f"scores/{score}"
 
 
 def stale_scores(scored_by: Mapping[str, str], also: frozenset[str] = frozenset()) -> list[str]:
@@ -38,7 +49,7 @@ def stale_scores(scored_by: Mapping[str, str], also: frozenset[str] = frozenset(
         scored_by: The digests in the cell's `status.json`.
         also: Scores of `ON_REQUEST` that are lacking too where the cell has none.
     """
-    known = scoring_code(also | on_request(scored_by))
+    known, scored_by = scoring_code(also | on_request(scored_by)), without_refactorings(scored_by)
     return [name for name, code in known.items() if scored_by.get(name) != code]
 
 

@@ -16,7 +16,7 @@ import pandas as pd
 
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.evaluation.metrics import METRICS, ON_REQUEST, VIEW_METRICS
-from xrgs.evaluation.scoring import PROTOCOL, stale_scores
+from xrgs.evaluation.scoring import PROTOCOL, stale_scores, without_refactorings
 from xrgs.experiment.cell_folder import CellState
 from xrgs.experiment.provenance import machine
 from xrgs.experiment.results import over_views
@@ -269,7 +269,7 @@ def _curve(
 def _done_columns(cell_id: str, cell: DoneCell) -> dict[str, Any]:
     """Return the columns of `Sweep.cells` for a cell that is done, but for its scores."""
     figures = msgspec.structs.asdict(cell.summary)
-    train, scored_by = cell.identity.train, cell.status.scored_by
+    train, scored_by = cell.identity.train, without_refactorings(cell.status.scored_by)
     size = cell.config.variant if cell.config else None
     return {
         **{metric.name: figures[metric.name] for metric in METRICS if metric.name in figures},

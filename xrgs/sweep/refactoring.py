@@ -17,6 +17,7 @@ import msgspec
 
 from xrgs.capture import frozen, variant
 from xrgs.errors import StoreError, XrgsError
+from xrgs.evaluation import scoring
 from xrgs.experiment import identity
 from xrgs.experiment.store import Store
 from xrgs.runtime.progress import log_line
@@ -100,18 +101,27 @@ def prove(store: Store, cells: Sequence[CellFolder], sample: int = 2) -> Proof:
         _train_again(store, cell)
     refactorings.declare(changes)
     identity.training_code.cache_clear()
+    scoring.scoring_code.cache_clear()
     return Proof(tuple(trained), tuple(built), tuple(parts))
 
 
 def _changes(cell: CellFolder) -> list[Change]:
-    """Return the parts of the code that a cell was trained with and that have changed since."""
+    """Return the parts of the code that trained and scored a cell and that have changed since."""
     trained = cell.identity()
     now, changed = identity.current_code(trained), identity.changed_code(trained)
     if any(part.startswith("plugins/") for part in changed):
         raise XrgsError(f"{cell.id}: a plugin has changed, which is no part of this package")
     if new := [part for part in changed if part not in trained.code or part not in now]:
         raise XrgsError(f"{cell.id}: {', '.join(new)} is not in both versions of the code")
-    return [(part, trained.code[part], now[part]) for part in changed]
+    return [(part, trained.code[part], now[part]) for part in changed] + _changes_of_scores(cell)
+
+
+def _changes_of_scores(cell: CellFolder) -> list[Change]:
+    """Return the scores of a cell whose code has changed since; a cell made again is scored too."""
+    scored_by = cell.status().scored_by
+    now = scoring.scoring_code(frozenset(scoring.on_request(scored_by)))
+    changed = scoring.stale_scores(scored_by)
+    return [(scoring.part_of(n), scored_by[n], now[n]) for n in changed if n in scored_by]
 
 
 def _changes_of_variant(store: Store, cell: CellFolder) -> list[Change]:
