@@ -231,6 +231,14 @@ def test_a_number_anywhere_in_the_core_changes_all_ids(
     assert ids_after(edited(package / name, old, new), confs) == (set(), set(confs))
 
 
+def test_the_code_of_a_dense_start_counts_where_it_is_on(
+    package: Path, confs: dict[str, Conf], compose: Callable[..., Conf]
+) -> None:
+    both = confs | {"dense": compose("splat.init=dense")}
+    edit = edited(package / "training/dense/depths.py", "_STEP = 0.35", "_STEP = 0.36")
+    assert ids_after(edit, both)[1] == {"dense"}
+
+
 def test_the_kernels_count_where_they_train(package: Path, confs: dict[str, Conf]) -> None:
     file = next(f for f in sorted((package / "csrc").rglob("*.cpp")))
 
@@ -262,11 +270,12 @@ def test_the_renderer_of_gsplat_and_its_version_count_where_it_renders(
 
 
 def test_every_file_of_the_model_and_of_training_is_hashed_or_changes_no_number() -> None:
+    of_components = (module for key in BUILT_IN for module in modules_of(key))
+    of_starts = (name for names in identity.START_CODE.values() for name in names)
     hashed = {
         file.relative_to(PACKAGE).as_posix()
         for file in code.sources(
-            *(*identity.CORE, *identity.BACKEND_CODE["gsplat"]),
-            *(m for key in BUILT_IN for m in modules_of(key)),
+            *identity.CORE, *identity.BACKEND_CODE["gsplat"], *of_components, *of_starts
         )
     }
     files = {

@@ -3,8 +3,8 @@
 1. Words don't count: comments, docstrings and blank lines of the code change no id.
 2. What is off is absent: a component that is off, its settings and its module are not in the
    identity, nor is any key at its `off` value (`xrgs.config.off`).
-3. The module of a component counts where the component is on. The core counts always, and the
-   native kernels count where the native backend trains.
+3. The module of a component counts where the component is on, and so does the code of a dense
+   start. The core counts always, and the native kernels count where the native backend trains.
 4. Scores are apart: metrics and the evaluation protocol have digests of their own
    (`xrgs.evaluation.scoring`), and `xrgs-store rescore` makes scores anew.
 5. A refactoring that changes no number keeps its cells: `xrgs-store prove` trains a sample of cells
@@ -80,9 +80,8 @@ CORE = (
 #: Files that count on one backend only. Of the native one these are the C++ sources, and not the
 #: compiled module: two builds of the same sources differ in their bytes and give the same numbers.
 BACKEND_CODE = {"native": ("csrc",), "gsplat": ("splat/gsplat",)}
-#: The code that places the first Gaussians, by the values of `splat.init` that have code of their
-#: own.
-STARTS = {"dense": ("training/dense",)}
+#: The code that places the first Gaussians, by the values of `splat.init`; that of others is core.
+START_CODE = {"dense": ("training/dense",)}
 
 
 def cell_identity(conf: Conf, variant_id: str) -> Identity:
@@ -157,8 +156,8 @@ def _files(backend: str, components: tuple[str, ...], init: str) -> dict[str, tu
     files: dict[str, tuple[str, ...]] = {"core": CORE}
     if backend in BACKEND_CODE:
         files[backend] = BACKEND_CODE[backend]
-    if init in STARTS:
-        files[init] = STARTS[init]
+    if init in START_CODE:
+        files[init] = START_CODE[init]
     return files | {key: modules_of(key) for key in components if modules_of(key)}
 
 
