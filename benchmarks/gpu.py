@@ -11,7 +11,7 @@ It prints a line a cell: recipe, backend, PSNR, LPIPS, Gaussians, and the second
 With both backends it then prints, for each recipe, gsplat less native, and ends with code 1 where
 PSNR differs by more than 0.3 dB or the Gaussians by more than 5 %. These bounds are a guess: nobody
 has run this on a GPU yet. On the CPU the two backends differ by rounding only, where
-`xrgs.rasterization` stands in for gsplat (tests/training/test_gsplat.py).
+`gsplat_api.rasterization` stands in for gsplat (tests/training/test_gsplat.py).
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ import pytest
 import torch
 from hypothesis import HealthCheck, settings
 
-from tests import forks
+from tests import forks, pdflatex
 from xrgs import composing, config
 from xrgs.capture import variant
 from xrgs.capture.dataset import Dataset, LoadedView
@@ -66,6 +66,18 @@ def _terminals_draw() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TERM", "xterm")
         yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _every_latex_table_compiles(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Compile every `table.tex` that the tests have made, at the end and in one go."""
+    yield
+    if pdflatex.PDFLATEX:
+        files = tmp_path_factory.getbasetemp().rglob("table.tex")
+        texts = dict.fromkeys(file.read_text(encoding="utf-8") for file in sorted(files))
+        if texts:
+            errors = pdflatex.errors_of(texts, tmp_path_factory.mktemp("pdflatex"))
+            assert not errors, errors
 
 
 @pytest.fixture(scope="session", autouse=True)

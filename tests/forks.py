@@ -31,7 +31,7 @@ WORKER = "xrgs.sweep.jobs.worker"
 #: What the commands and the children of a sweep import, some of it late.
 MODULES = (
     *(f"xrgs.cli.{name}" for name in ("bench", "render", "report", "status", "store", "sweep")),
-    *("kornia.losses", "matplotlib.backends.backend_agg"),
+    *("xrgs.capture.sfm", "kornia.losses", "matplotlib.backends.backend_agg"),
     *("xrgs.bench.run", "xrgs.experiment.cell", "xrgs.report", "xrgs.sweep.rerun"),
     *("xrgs.viewer.film", "xrgs.viewer.trained"),
 )
@@ -131,11 +131,6 @@ def server() -> Iterator[Callable[..., tuple[int, str, str]]]:
 
 
 def _serve(file: str) -> None:
-    from xrgs.runtime.machine import set_passive_openmp_wait
-    from xrgs.sweep.jobs.worker import _import_colmap
-
-    set_passive_openmp_wait()
-    _import_colmap()
     for name in MODULES:
         import_module(name)
     with _Server(file, _Handler) as listening:

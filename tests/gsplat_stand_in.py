@@ -1,4 +1,4 @@
-"""`xrgs.rasterization` in the place of `gsplat.rasterization`, for `splat.backend=gsplat`.
+"""`gsplat_api.rasterization` in the place of `gsplat.rasterization`, for `splat.backend=gsplat`.
 
 gsplat's kernels need a GPU. Ours have the signature and the constants of gsplat 1.5.3, which the
 tests have installed.
@@ -17,8 +17,7 @@ import pytest
 import torch
 from torch import Tensor
 
-import xrgs
-from xrgs.splat import backend
+from xrgs.splat import backend, gsplat_api
 
 #: The setting that equals the constant of gsplat 1.5.3's kernels.
 ALPHA_MAX = "splat.raster.alpha_max=0.999"
@@ -44,12 +43,12 @@ class _Means2d:
 
 
 def rasterization(**given: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """`xrgs.rasterization` of tensors that are all on one device, the backend's."""
+    """`gsplat_api.rasterization` of tensors that are all on one device, the backend's."""
     tensors = {name: value for name, value in given.items() if isinstance(value, Tensor)}
     devices = {value.device for value in tensors.values()}
     assert {device.type for device in devices} == {backend.DEVICES["gsplat"]}, tensors
     (device,) = devices
-    image, alpha, meta = xrgs.rasterization(
+    image, alpha, meta = gsplat_api.rasterization(
         **given | {name: value.cpu() for name, value in tensors.items()}
     )
     meta["radii"] = meta["radii"].to(device)

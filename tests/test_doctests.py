@@ -33,7 +33,7 @@ def names(data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dic
     torch.manual_seed(0)
     points = torch.rand(50, 3) + torch.tensor([-0.5, -0.5, 2.0])
     gaussians = xrgs.Gaussians.from_points(points, torch.rand(50, 3))
-    xrgs.save_ply("splats.ply", gaussians)
+    xrgs.save_gaussians("splats.ply", gaussians)
     K = torch.tensor([[40.0, 0.0, 24.0], [0.0, 40.0, 16.0], [0.0, 0.0, 1.0]])
     variant_id = next(Path("xrgs-store/variants").glob("[0-9a-f]*")).name
     given = {

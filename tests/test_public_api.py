@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import inspect
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -29,6 +30,38 @@ def test_import_is_light() -> None:
         [sys.executable, "-P", "-c", script], capture_output=True, text=True, check=True
     )
     assert done.stdout.splitlines() == ["", "False"]
+
+
+def python(script: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run a script in a new interpreter, with no policy of OpenMP but in `environment`."""
+    kept = {name: text for name, text in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    command = [sys.executable, "-P", "-W", "always", "-c", script]
+    return subprocess.run(
+        command, capture_output=True, text=True, check=True, env=kept | environment
+    )
+
+
+@pytest.mark.parametrize("given", [{}, {"OMP_WAIT_POLICY": "active"}])
+def test_openmps_threads_sleep_unless_the_environment_says_otherwise(given: dict[str, str]) -> None:
+    done = python("import os, xrgs; print(os.environ['OMP_WAIT_POLICY']); xrgs.rasterize", **given)
+    assert done.stdout.split() == [given.get("OMP_WAIT_POLICY", "passive")]
+    assert done.stderr == ""
+
+
+@pytest.mark.parametrize("name", ["rasterize", "train"])
+def test_torch_before_xrgs_is_warned_of_once_where_something_renders(name: str) -> None:
+    script = f"import torch, xrgs; xrgs.load_gaussians; xrgs.{name}; xrgs.rasterize; xrgs.train"
+    done = python(script)
+    assert done.stderr.count("import xrgs before torch, or set OMP_WAIT_POLICY=passive") == 1
+    assert python(script, OMP_WAIT_POLICY="passive").stderr == ""
+
+
+@pytest.mark.parametrize("name", ["load_ply", "rasterization", "save_ply"])
+def test_a_name_that_will_go_works_and_says_what_to_use(name: str) -> None:
+    with pytest.warns(DeprecationWarning, match=rf"xrgs\.{name} will be removed .*: use xrgs\."):
+        found = getattr(xrgs, name)
+    assert found.__name__ == name
+    assert name not in xrgs.__all__
 
 
 def static_imports() -> dict[str, str]:

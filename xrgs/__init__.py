@@ -5,19 +5,25 @@ ablations of Cross-Resolution Gaussian Splatting, and reports percentage-change 
 
 From Python, `import xrgs` gives:
 
-- `load_ply`, `save_ply`, `Gaussians`, `Camera`: Gaussians in and out, and views of them;
-  `load_gaussians` and `save_gaussians` for .ply, .glb and .spz, and whether they are antialiased.
+- `load_gaussians`, `save_gaussians`, `Gaussians`, `Camera`: Gaussians in and out as .ply, .glb or
+  .spz, and views of them.
 - `rasterize`: render Gaussians with a camera, with settings in `RasterSettings`; gives a `Render`.
-- `rasterization`: the same with gsplat's signature and results.
+  `xrgs.splat.gsplat_api` has `rasterization`, with gsplat's signature and results.
 - `compose`: the config of a command line; `build_dataset` or `load_dataset`: what it is trained on;
   `train`: train it.
 - `Store`: the results of sweeps as tables and objects.
 
 Each name is imported when it is first used, so that planning a sweep never waits for torch.
+Importing the package sets OMP_WAIT_POLICY to `passive` where the environment has no value: torch's
+threads then sleep between its loops, and leave the cores to the kernels. torch reads it when it is
+loaded, so import xrgs first.
 """
 
 from __future__ import annotations
 
+import os
+import sys
+import warnings
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -29,8 +35,6 @@ if TYPE_CHECKING:
     from xrgs.splat.cameras import Camera
     from xrgs.splat.files import load_gaussians, save_gaussians
     from xrgs.splat.gaussians import Gaussians
-    from xrgs.splat.gsplat_api import rasterization
-    from xrgs.splat.ply import load_ply, save_ply
     from xrgs.splat.rendering import Render, rasterize
     from xrgs.splat.settings import RasterSettings
     from xrgs.training.count_matching import train_cell as train
@@ -48,11 +52,8 @@ __all__ = [
     "compose",
     "load_dataset",
     "load_gaussians",
-    "load_ply",
-    "rasterization",
     "rasterize",
     "save_gaussians",
-    "save_ply",
     "train",
 ]
 
@@ -70,19 +71,49 @@ _MODULES = {
     "compose": "xrgs.composing",
     "load_dataset": "xrgs.capture.prepare",
     "load_gaussians": "xrgs.splat.files",
-    "load_ply": "xrgs.splat.ply",
-    "rasterization": "xrgs.splat.gsplat_api",
     "rasterize": "xrgs.splat.rendering",
     "save_gaussians": "xrgs.splat.files",
-    "save_ply": "xrgs.splat.ply",
     "train": "xrgs.training.count_matching",
 }
+#: Names of version 0.2 that the next one removes: their modules, and what to use.
+_DEPRECATED = {
+    "load_ply": ("xrgs.splat.ply", "xrgs.load_gaussians(path).gaussians"),
+    "rasterization": ("xrgs.splat.gsplat_api", "xrgs.splat.gsplat_api.rasterization"),
+    "save_ply": ("xrgs.splat.ply", "xrgs.save_gaussians"),
+}
+#: Names that render on the processor, where threads of torch that spin take the cores.
+_RENDERING = ("rasterize", "train")
+#: Whether torch's threads spin: it was loaded first, with no policy in the environment. A warning
+#: sets it back.
+_SPINNING = "torch" in sys.modules and "OMP_WAIT_POLICY" not in os.environ
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+
+def warn_of_spinning() -> None:
+    """Warn once where torch's threads spin between its loops, and say what to do."""
+    if not _SPINNING:
+        return
+    globals()["_SPINNING"] = False
+    warnings.warn(
+        "torch was imported before xrgs, so its threads spin between loops and take the cores from"
+        " rendering, which can be 100 times slower on a busy machine: import xrgs before torch, or"
+        " set OMP_WAIT_POLICY=passive",
+        RuntimeWarning,
+        stacklevel=3,
+    )
 
 
 if not TYPE_CHECKING:  # else type checkers would take any name to be there
 
     def __getattr__(name: str) -> Any:
         """Import a public name when it is first used (PEP 562)."""
+        if name in _RENDERING:
+            warn_of_spinning()
+        if name in _DEPRECATED:
+            module, use = _DEPRECATED[name]
+            text = f"xrgs.{name} will be removed in the next version: use {use}"
+            warnings.warn(text, DeprecationWarning, stacklevel=2)
+            return getattr(import_module(module), name)
         if name not in _MODULES:
             raise AttributeError(f"module 'xrgs' has no attribute {name!r}")
         inner_name = _NAMES_IN_MODULES.get(name, name)

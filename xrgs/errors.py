@@ -18,7 +18,7 @@ class XrgsError(Exception):
 
     Examples:
         >>> try:
-        ...     load_ply("missing.ply")
+        ...     load_gaussians("missing.ply")
         ... except XrgsError as error:
         ...     print(error)
         missing.ply: cannot be read: No such file or directory

@@ -100,7 +100,7 @@ def test_exported_splats_cameras_and_points_are_in_one_frame(
     assert {(entry["split"], entry["tag"]) for entry in split} == {
         *(("train", "HR"), ("train", "LR"), ("test", "HR"))
     }
-    gaussians = xrgs.load_ply(out / "splats.ply")
+    gaussians = xrgs.load_gaussians(out / "splats.ply").gaussians
     for entry in split:
         viewmat, K, size = cameras[entry["file"]]
         with Image.open(out / "images" / entry["file"]) as image:
@@ -211,7 +211,7 @@ def test_the_splats_of_a_cell_render_the_same_from_every_format(
 def test_files_of_gaussians_are_converted(xrgs_data: XrgsData, tmp_path: Path) -> None:
     points = torch.rand(9, 3, generator=torch.Generator().manual_seed(0))
     gaussians = xrgs.Gaussians.from_points(points, points)
-    xrgs.save_ply(tmp_path / "a.b.ply", gaussians, antialiased=True)
+    xrgs.save_gaussians(tmp_path / "a.b.ply", gaussians, antialiased=True)
     for _ in range(2):  # a file is replaced
         for source, form, made in (("a.b.ply", "glb", "a.b.glb"), ("./a.b.glb", "spz", "a.b.spz")):
             code, said, err = xrgs_data("export", source, "--format", form)

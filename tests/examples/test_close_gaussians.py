@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 
 from tests import reference_store as reference
-from xrgs import Gaussians, Store, rasterize, save_ply
+from xrgs import Gaussians, Store, rasterize, save_gaussians
 from xrgs.evaluation.protocol import mean_scores
 
 COUNT = 4
@@ -42,7 +42,7 @@ def test_what_is_close_to_one_camera_is_counted_and_left_out(
     conf = cell.config().splat
     truth = [mean_scores(scene, [view], conf)["psnr"] for view in views]
     harmed = [mean_scores(joined(scene, close), [view], conf)["psnr"] for view in views]
-    save_ply(cell.path / "splats.ply", joined(scene, close))
+    save_gaussians(cell.path / "splats.ply", joined(scene, close))
     png = tmp_path / "pair.png"
 
     script("close_gaussians").main(

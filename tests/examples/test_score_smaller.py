@@ -16,7 +16,7 @@ from skimage.measure import block_reduce
 from skimage.metrics import peak_signal_noise_ratio
 
 from tests import reference_store as reference
-from xrgs import Gaussians, Store, rasterize, save_ply
+from xrgs import Gaussians, Store, rasterize, save_gaussians
 from xrgs.evaluation.metrics import ssim
 from xrgs.evaluation.protocol import mean_scores
 
@@ -36,7 +36,7 @@ def test_views_are_scored_at_both_sizes(
     cell = Store(tmp_path).cell_folders()[0]
     data = cell.dataset()
     gaussians = Gaussians.from_points(data.points, data.colors)
-    save_ply(cell.path / "splats.ply", gaussians)
+    save_gaussians(cell.path / "splats.ply", gaussians)
     settings = cell.config().splat.raster
     expected: dict[str, list[float]] = {}
     for view in data.test:

@@ -18,10 +18,10 @@ import torch
 from kornia.losses import SSIMLoss
 from PIL import Image
 
-import xrgs
 from tests import reference_store as reference
 from xrgs import Gaussians, Store
 from xrgs.evaluation.files import score_file
+from xrgs.splat.gsplat_api import rasterization
 
 
 def test_ssim_is_kornias_over_the_windows_inside(script: Callable[[str], ModuleType]) -> None:
@@ -58,7 +58,7 @@ def test_a_cell_is_saved_and_trained_on(
     data = cell.dataset()
     tests = [view for view in cell.variant().views if view.split == "test"]
     main = script("train_with_gsplat").main
-    monkeypatch.setattr("gsplat.rasterization", xrgs.rasterization)
+    monkeypatch.setattr("gsplat.rasterization", rasterization)
 
     main(["save", cell.id, str(scene), "--store", str(store)])
     psnr = {}

@@ -14,13 +14,13 @@ import torch
 from PIL import Image
 from scipy.spatial import cKDTree
 
-import xrgs
 from xrgs.capture import images
 from xrgs.capture.colmap import read_points
 from xrgs.capture.frozen import freeze
 from xrgs.capture.views import Variant, View
 from xrgs.experiment.export import export, without_invisible
 from xrgs.splat.gaussians import Gaussians
+from xrgs.splat.gsplat_api import rasterization
 
 
 def masked_variant(folder: Path) -> Variant:
@@ -108,7 +108,7 @@ def test_gaussians_that_no_render_shows_are_left_out(
     assert len(shown) == (opacities >= 1 / 255).sum()
     K = torch.tensor([[40.0, 0, 20], [0, 40, 15], [0, 0, 1]])
     before, after = (
-        xrgs.rasterization(
+        rasterization(
             some.means,
             some.quats,
             some.scales.exp(),

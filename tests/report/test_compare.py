@@ -20,6 +20,7 @@ from xrgs.report.inference import (
     NOT_POSITIVE,
     OTHER_CODE,
     OTHER_MACHINE,
+    OTHER_THREADS,
     WRONG_GAP,
 )
 from xrgs.report.paper import paper_tables
@@ -263,6 +264,14 @@ def test_times_of_another_machine_are_left_out(made: Any, against: str) -> None:
     ):
         mean = mean_of(comparison, name, label)
         assert (mean["change"], mean["scenes"], mean["why"]) == (pytest.approx(change), scenes, why)
+
+
+def test_another_number_of_threads_is_called_that(made: Any) -> None:
+    made.add()
+    made.add("consistency", provenance={"threads": 1})
+    comparison = compared(made)
+    assert mean_of(comparison, "training_time_s")["why"] == OTHER_THREADS
+    assert mean_of(comparison, "gaussians")["why"] == ""
 
 
 def test_times_of_several_machines_in_turn_are_like_those_of_no_other_cell(made: Any) -> None:

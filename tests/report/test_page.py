@@ -191,10 +191,19 @@ def test_times_of_different_machines_are_warned_of(made: Any) -> None:
     report = build(made.store.path, pictures=[])
     warning = (
         "The cells were trained on different machines (a processor, threads 2, torch; another"
-        " processor, threads 2, torch): times are compared between cells of one machine alone."
+        " processor, threads 2, torch): times are compared only between cells of one machine."
     )
     assert warning in report.text
     assert warning in (report.folder / "table.md").read_text()
+
+
+def test_times_with_different_numbers_of_threads_are_warned_of(made: Any) -> None:
+    made.add()
+    made.add("consistency", provenance={"threads": 1})
+    made.write()
+    text = build(made.store.path, pictures=[]).text
+    assert "trained with different numbers of threads (a processor, threads 1, torch; a" in text
+    assert "machine" not in text
 
 
 def test_a_corrupt_cell_is_not_trusted(study: Any) -> None:
@@ -222,12 +231,27 @@ def test_baselines_alone_have_their_values(made: Any) -> None:
     assert " 100 s" in build(made.store.path, pictures=[]).text
 
 
+def test_a_failed_scene_gives_its_reason_first_and_no_rows_of_missing(made: Any) -> None:
+    made.add()
+    made.add_error("leaves")
+    made.write(("scene=[fern,leaves]",))
+    report = build(made.store.path, pictures=[])
+    assert report.text.startswith("1 of 2 cells gave no number")
+    assert "missing" not in report.text
+    page = (report.folder / "table.md").read_text()
+    assert page.index("1 of 2 cells") < page.index("### Values")
+    assert "missing" not in page
+
+
 def test_a_sweep_of_which_everything_failed(made: Any) -> None:
     made.add_error("leaves")
     made.add_error("leaves", "consistency")
     made.write()
     report = build(made.store.path)
-    assert "2 of 2 cells gave no number" in report.text
+    assert report.text.startswith("2 of 2 cells gave no number")
+    assert "leaves: 3 of 24 views registered" in report.text
+    for text in (report.text, (report.folder / "table.md").read_text()):
+        assert "missing" not in text
     assert report.text.count(TO_TRY[1]) == 1
 
 

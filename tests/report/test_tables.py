@@ -15,7 +15,7 @@ from xrgs.report.context import Context
 from xrgs.report.page import build
 from xrgs.report.tables import Tables
 from xrgs.report.writing import legend, pointed
-from xrgs.runtime.text import TextTable
+from xrgs.runtime.text import TextTable, to_text
 
 BY_NAME = {metric.name: metric for metric in METRICS}
 
@@ -30,8 +30,11 @@ def rows_of(table: TextTable) -> dict[str, dict[str, str]]:
     return {row[0]: dict(zip(table.columns, row, strict=True)) for row in table.rows}
 
 
-def meanings(comparison: Comparison) -> dict[str, str]:
-    return {row[0]: row[1] for row in legend(comparison).rows}
+def meanings(built: Tables) -> dict[str, str]:
+    """The legend of the overviews and the means of all ablations."""
+    comparison = built.comparison
+    shown = [*built.overviews(), *(built.mean(*group) for group in comparison.groups)]
+    return {row[0]: row[1] for row in legend(comparison, shown).rows}
 
 
 def test_psnr_changes_by_decibels_and_all_else_by_percent(made: Any) -> None:
@@ -39,8 +42,8 @@ def test_psnr_changes_by_decibels_and_all_else_by_percent(made: Any) -> None:
     made.add("consistency", factors={"psnr": 0.99, "lpips": 0.5})
     table = tables(made).mean("consistency", "")
     rows = {row[0]: row for row in table.rows}
-    assert rows["PSNR, dB"] == ("PSNR, dB", "20.00 dB", "19.80 dB", "-0.20 ↓")
-    assert rows["LPIPS, %"] == ("LPIPS, %", "0.2500", "0.1250", "-50.00 ↑")
+    assert rows["PSNR"] == ("PSNR", "20.00 dB", "19.80 dB", "-0.20 dB ↓")
+    assert rows["LPIPS"] == ("LPIPS", "0.2500", "0.1250", "-50.00 % ↑")
     assert table.title == "consistency against baseline: scene fern, seed 0"
 
 
@@ -60,8 +63,8 @@ def test_what_has_no_change_says_why_in_a_table_of_one_replicate(made: Any) -> N
     made.add(values={"gaussians": 0})
     made.add("consistency")
     rows = rows_of(tables(made).mean("consistency", ""))
-    assert rows["Gaussians, %"]["verdict"] == "n/a: not above zero"
-    assert rows["PSNR, dB"]["verdict"] == ""
+    assert rows["Gaussians"]["verdict"] == "n/a: not above zero"
+    assert rows["PSNR"]["verdict"] == ""
 
 
 def test_a_second_replicate_brings_columns_and_a_third_one_verdicts(made: Any) -> None:
@@ -72,16 +75,16 @@ def test_a_second_replicate_brings_columns_and_a_third_one_verdicts(made: Any) -
             table = tables(made).mean("consistency", "")
             assert table.columns[4:] == ("95 % interval", "same sign (p)", "verdict")
             assert table.context == ""
-            assert rows_of(table)["Gaussians, %"]["verdict"] == "not shown"
+            assert rows_of(table)["Gaussians"]["verdict"] == "not shown"
     table = tables(made).mean("consistency", "")
     assert table.columns[4:] == ("95 % interval", "same sign (p)", "q", "verdict")
     rows = rows_of(table)
-    assert rows["Gaussians, %"]["verdict"] == "worse"
-    assert rows["PSNR, dB"]["verdict"] == "equivalent"
-    assert rows["SSIM, %"]["verdict"] == "descriptive"
+    assert rows["Gaussians"]["verdict"] == "worse"
+    assert rows["PSNR"]["verdict"] == "equivalent"
+    assert rows["SSIM"]["verdict"] == "descriptive"
     assert [row[0] for row in table.rows][:6] == [
-        *("PSNR, dB", "PSNR (pooled), dB", "PSNR (worst view), dB", "LPIPS, %"),
-        *("Alpha evaluations, %", "Gaussians, %"),
+        *("PSNR", "PSNR (pooled)", "PSNR (worst view)", "LPIPS"),
+        *("Alpha evaluations", "Gaussians"),
     ]
 
 
@@ -169,9 +172,7 @@ def test_the_signs_stand_beside_the_interval(made: Any) -> None:
         made.add(seed=seed)
         made.add("consistency", seed=seed, factors={"gaussians": factor})
     built = tables(made)
-    assert (
-        rows_of(built.mean("consistency", ""))["Gaussians, %"]["same sign (p)"] == "2 of 3 (1.000)"
-    )
+    assert rows_of(built.mean("consistency", ""))["Gaussians"]["same sign (p)"] == "2 of 3 (1.000)"
     long = built.long()
     rows = long[long["metric"] == "gaussians"]
     assert rows[["agree", "n_values", "pairs"]].to_numpy().tolist() == [[2, 3, 3], [2, 3, 3]]
@@ -227,7 +228,7 @@ def test_pairs_left_out_of_a_mean_are_named(made: Any) -> None:
     made.add("consistency", scene="room", factors={"gaussians": 2.0})
     table = tables(made).mean("consistency", "")
     assert "Gaussians: pairs left out (not above zero)" in table.notes
-    assert rows_of(table)["Gaussians, %"]["change"] == "+100.00 ↓ (1 of 2)"
+    assert rows_of(table)["Gaussians"]["change"] == "+100.00 % ↓ (1 of 2)"
 
 
 def test_the_long_table_has_every_number_at_full_precision(made: Any) -> None:
@@ -307,7 +308,7 @@ def test_q_and_the_marks_of_verdicts_stand_in_the_tables(made: Any) -> None:
     rows = rows_of(overview)
     assert [rows[label]["PSNR, dB"] for label in "ab"] == ["+1.00 ↑ *", "+2.00 ↑ *"]
     assert [rows[label]["LPIPS, %"] for label in "ab"] == ["0.00 = ≈", "0.00 = ≈"]
-    row = rows_of(built.mean("a", ""))["PSNR, dB"]
+    row = rows_of(built.mean("a", ""))["PSNR"]
     # t = 1 / (0.1 / sqrt(3)) with 2 degrees of freedom: p = 0.00332; the views of a cell differ by
     # the same, so that PSNR of the worst view and pooled are tests of equal p.
     assert row["q"] == "0.003"
@@ -322,28 +323,45 @@ def test_a_headline_label_has_holms_p_and_a_line_in_the_legend(made: Any) -> Non
     add_three(made, "a", "b")
     built = tables(made, design=Design(headline=("a",)))
     # Three tests of p = 0.00332: PSNR in its three ways.
-    row = rows_of(built.mean("a", ""))["PSNR, dB"]
+    row = rows_of(built.mean("a", ""))["PSNR"]
     assert (row["p (Holm)"], row["verdict"]) == ("0.010", "better")
     assert "q" not in row
-    assert "q" in rows_of(built.mean("b", ""))["PSNR, dB"]
-    lines = meanings(built.comparison)
+    assert "q" in rows_of(built.mean("b", ""))["PSNR"]
+    lines = meanings(built)
     assert lines["p (Holm)"].startswith("the p of a, corrected by Holm")
-    assert "p (Holm)" not in meanings(tables(made).comparison)
+    assert "p (Holm)" not in meanings(tables(made))
 
 
 def test_the_legend_has_the_outcomes_and_margins(made: Any) -> None:
     add_three(made, "a")
     design = Design(outcomes=("lpips", "ssim"), margin_psnr=0.3, margin_lpips=7)
-    lines = meanings(tables(made, design=design).comparison)
+    lines = meanings(tables(made, design=design))
     assert lines["descriptive"].endswith("the outcomes of this report are LPIPS, SSIM")
     assert "0.3 dB of PSNR or 7 % of LPIPS" in lines["equivalent ≈"]
+
+
+def test_the_legend_explains_only_what_occurs_and_fits_a_terminal(made: Any) -> None:
+    made.add()
+    made.add("a", factors={"psnr": 0.99})
+    assert [*meanings(tables(made))] == ["change", "↑ ↓ ="]
+    add_three(made, "a")
+    built = tables(made)
+    terms = meanings(built)
+    assert {"95 % interval", "new scene", "q", "not shown", "descriptive"} <= {*terms}
+    assert "(3 of 4)" not in terms
+    made.add("b", factors={"psnr": 0.9})
+    assert "(3 of 4)" in meanings(tables(made))
+    lines = to_text(legend(built.comparison, [built.mean("a", "")])).split("\n")
+    assert 80 < max(map(len, lines)) <= 100
+    for meaning in terms.values():
+        assert meaning in " ".join(" ".join(lines).split())
 
 
 def test_two_scenes_allow_no_verdict_and_no_star(made: Any) -> None:
     for scene, factor in (("fern", 1.5), ("room", 1.5001)):
         made.add(scene=scene)
         made.add("a", scene=scene, factors={"psnr": factor})
-    row = rows_of(tables(made).mean("a", ""))["PSNR, dB"]
+    row = rows_of(tables(made).mean("a", ""))["PSNR"]
     assert row["verdict"] == "not shown"
     assert "q" not in row
     assert "*" not in row["change"]

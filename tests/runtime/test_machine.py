@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 import resource
-import subprocess
 import sys
 from pathlib import Path
 
@@ -17,7 +16,6 @@ from xrgs.runtime import machine
 from xrgs.runtime.machine import (
     gpus,
     peak_rss,
-    set_passive_openmp_wait,
     set_portable_blas,
     set_torch_threads,
     single_torch_thread,
@@ -152,17 +150,6 @@ def test_a_block_has_one_thread_and_the_others_return_at_its_end() -> None:
         torch.set_num_threads(before)
 
 
-def test_openmps_threads_sleep_unless_the_environment_says_otherwise(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
-    set_passive_openmp_wait()
-    assert os.environ["OMP_WAIT_POLICY"] == "passive"
-    monkeypatch.setenv("OMP_WAIT_POLICY", "active")
-    set_passive_openmp_wait()
-    assert os.environ["OMP_WAIT_POLICY"] == "active"
-
-
 def test_openblas_has_the_kernels_of_avx2_wherever_there_is_avx2(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -178,36 +165,6 @@ def test_openblas_has_the_kernels_of_avx2_wherever_there_is_avx2(
     monkeypatch.setenv("OPENBLAS_CORETYPE", "Zen")
     set_portable_blas(cpuinfo)
     assert os.environ["OPENBLAS_CORETYPE"] == "Zen"
-
-
-@pytest.mark.parametrize(
-    "command",
-    [
-        "from xrgs.sweep.jobs.worker import main; main('none', 'request.json', 'answer.json')",
-        "from xrgs.cli.bench import main; main()",
-    ],
-)
-def test_commands_set_the_wait_policy_before_torch_is_imported(
-    tmp_path: Path, command: str
-) -> None:
-    (tmp_path / "request.json").write_text("{}")
-    script = f"""
-import sys, xrgs.runtime.machine
-def recorded():
-    assert "torch" not in sys.modules
-    print("called")
-xrgs.runtime.machine.set_passive_openmp_wait = recorded
-sys.argv[1:] = ["--repeats=none"]
-{command}
-"""
-    done = subprocess.run(
-        [sys.executable, "-P", "-c", script],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.stdout.startswith("called\n"), done.stderr
 
 
 @pytest.mark.parametrize(("platform", "unit"), [("linux", 1024), ("darwin", 1)])

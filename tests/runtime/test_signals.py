@@ -54,3 +54,26 @@ def test_a_second_signal_ends_the_process_at_once() -> None:
 
 def test_an_ignored_signal_stays_ignored() -> None:
     assert stopped("nohup", signal.SIGINT) == (0, "ready\ntidied up\n", "")
+
+
+def test_colmap_leaves_the_handlers_of_signals_as_they_were() -> None:
+    """COLMAP's log library takes SIGTERM and the signals of crashes, and prints a stack at them."""
+    script = """
+import faulthandler, os, signal, threading
+faulthandler.enable()
+def imported():
+    from xrgs.capture import sfm
+threading.Thread(target=imported).start() if {thread} else imported()
+[thread.join() for thread in threading.enumerate() if thread is not threading.current_thread()]
+os.kill(os.getpid(), signal.{name})
+"""
+    for name, thread, said in (("SIGTERM", 0, ""), ("SIGTERM", 1, ""), ("SIGABRT", 0, "Fatal Py")):
+        done = subprocess.run(
+            [sys.executable, "-P", "-c", script.format(name=name, thread=thread)],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == -getattr(signal, name)
+        assert done.stderr.startswith(said)
+        assert "***" not in done.stderr

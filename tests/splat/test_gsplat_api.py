@@ -1,4 +1,4 @@
-"""`xrgs.rasterization` against gsplat 1.5.3: its torch code and its strategy."""
+"""`gsplat_api.rasterization` against gsplat 1.5.3: its torch code and its strategy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The arguments of `xrgs.rasterization`: gsplat's signature, and what is refused by name."""
+"""The arguments of `gsplat_api.rasterization`: gsplat's signature, and what is refused by name."""
 
 from __future__ import annotations
 

@@ -93,6 +93,31 @@ def test_states_are_read_from_the_cells_files_alone(watched: Watched) -> None:
     assert str(monitor.snapshot()).startswith("2 of 6 cells done, 3 failed, ~15 s left")
 
 
+def test_progress_never_goes_back(watched: Watched, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A cell has no progress file for a moment between its evaluation and its end."""
+    monitor = SweepMonitor(watched.store.cells_folder)
+    monitor.watch([watched.plan("a", seconds=1000.0, scoring=10.0), watched.plan("b")])
+    watched.begin("a")
+    seen = []
+    monkeypatch.setattr(monitor_module, "is_terminal", lambda _: True)
+    monkeypatch.setattr("sys.stderr", io.StringIO())
+    for done, what in ((50, "training"), (100, "training"), (3, "evaluating"), (0, "training")):
+        watched.step("a", done, 10.0, what)
+        monitor._show(monitor.snapshot())
+        seen.append(monitor._bar.n)  # type: ignore[union-attr]
+    assert seen == [0.5, 1.0, 1.0, 1.0]
+    watched.step("a", 100, 10.0)
+    monitor.snapshot()
+    watched.store.cell("a").progress.unlink()
+    snapshot = monitor.snapshot()
+    assert snapshot.progress == 1.0
+    (waiting, _) = snapshot.waiting
+    assert snapshot.expected_s(waiting, snapshot.trained(waiting)) == pytest.approx(10.0)
+    watched.finish("a")
+    assert monitor.snapshot().progress == 1.0
+    monitor._bar.close()  # type: ignore[union-attr]
+
+
 def test_another_sweeps_cell_is_waited_for(watched: Watched) -> None:
     monitor = SweepMonitor(watched.store.cells_folder)
     monitor.watch([watched.plan("a"), watched.plan("b", "running")])

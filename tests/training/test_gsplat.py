@@ -1,7 +1,7 @@
 """Training with `splat.backend=gsplat`: as on the native backend, and with nothing on the CPU.
 
-gsplat's kernels need a GPU. `xrgs.rasterization` stands in for them, and a device that has a GPU's
-rules for the GPU (`tests/fake_gpu.py`).
+gsplat's kernels need a GPU. `gsplat_api.rasterization` stands in for them, and a device that has a
+GPU's rules for the GPU (`tests/fake_gpu.py`).
 """
 
 from __future__ import annotations

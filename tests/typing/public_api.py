@@ -10,13 +10,13 @@ import pandas as pd
 from torch import Tensor
 
 import xrgs
-from xrgs import Camera, Gaussians, RasterSettings, Store, load_ply, rasterization, rasterize
+from xrgs import Camera, Gaussians, RasterSettings, Store, load_gaussians, rasterize
+from xrgs.splat.gsplat_api import rasterization
 
-gaussians = load_ply("splats.ply")
+gaussians = load_gaussians("splats.ply").gaussians
 assert_type(gaussians, Gaussians)
 assert_type(len(gaussians), int)
 assert_type(gaussians.scales, Tensor)
-xrgs.save_ply("copy.ply", gaussians)
 xrgs.save_gaussians("copy.glb", gaussians, antialiased=True)
 assert_type(xrgs.load_gaussians("copy.glb").gaussians, Gaussians)
 assert_type(xrgs.load_gaussians("copy.glb").antialiased, bool)
@@ -60,7 +60,7 @@ assert_type(xrgs.train(data, conf).gaussians, Gaussians)
 assert_type(xrgs.train(xrgs.load_dataset("variant", "hr_only"), conf).seconds, float)
 
 xrgs.rasterise(gaussians)  # type: ignore[attr-defined]
-load_ply(3)  # type: ignore[arg-type]
+load_gaussians(3)  # type: ignore[arg-type]
 rasterize(camera, gaussians)  # type: ignore[arg-type]
 rasterize(gaussians, camera, degree=3)  # type: ignore[call-arg]
 image = rasterize(gaussians, camera).colors  # type: ignore[attr-defined]

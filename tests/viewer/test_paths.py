@@ -89,6 +89,57 @@ def test_an_orbit_stays_where_the_scene_was_photographed_from() -> None:
     assert angles[20] == pytest.approx(10, abs=0.5), "and back"
 
 
+def outwards(degrees: Array, radius: float = 1.0) -> Poses:
+    """Cameras on a circle in a room, which look at its walls."""
+    angles = np.radians(degrees)
+    ways = np.stack([np.cos(angles), np.sin(angles), 0 * angles], 1)
+    viewmats = np.stack([looking_at(TARGET + radius * w, TARGET + 4 * w) for w in ways])
+    return Poses(viewmats, viewmats[:1], np.concatenate([TARGET + 4 * ways, TARGET + 3.8 * ways]))
+
+
+def on_a_dome(seed: int) -> Poses:
+    """Cameras all around an object, at any height above it and at different distances."""
+    rng = np.random.default_rng(seed)
+    angles, heights = rng.uniform(0, 2 * np.pi, 60), np.radians(rng.uniform(5, 60, 60))
+    flat = np.cos(heights)
+    ways = np.stack([flat * np.cos(angles), flat * np.sin(angles), np.sin(heights)], 1)
+    places = TARGET + ways * rng.uniform(0.8, 1.25, (60, 1))
+    viewmats = np.stack([looking_at(p, TARGET + rng.normal(0, 0.05, 3)) for p in places])
+    return Poses(viewmats, viewmats[:1], TARGET + rng.normal(0, 0.1, (200, 3)))
+
+
+@pytest.mark.parametrize(
+    ("poses", "path"),
+    [
+        (ring(np.arange(0.0, 360.0, 10.0)), "orbit"),
+        (ring(np.arange(0.0, 360.0, 45.0)), "orbit"),
+        (ring(np.array([350.0, 5.0, 20.0, 30.0])), "orbit"),
+        (on_a_dome(0), "orbit"),
+        (on_a_dome(1), "orbit"),
+        (facing_one_way(), "orbit"),
+        (outwards(np.arange(0.0, 360.0, 10.0)), "training"),
+        (outwards(np.arange(0.0, 360.0, 10.0), radius=0.2), "training"),
+        (outwards(np.arange(0.0, 180.0, 10.0)), "training"),
+    ],
+    ids=["ring", "few", "arc", "dome", "another-dome", "forward", "room", "panorama", "half-room"],
+)
+def test_an_orbit_is_the_default_where_the_cameras_see_its_space(poses: Poses, path: str) -> None:
+    assert paths.default_path(poses) == path
+
+
+def test_the_path_along_the_training_cameras_goes_through_some_of_them() -> None:
+    poses = outwards(np.arange(0.0, 360.0, 7.5))
+    path = paths.through_training_views(poses, 121)
+    passed = poses.train[np.linspace(0, 47, 13).round().astype(int)]
+    assert path[::10] == pytest.approx(passed, abs=1e-6)  # cameras are float32
+    distances = np.linalg.norm(camera_positions(path) - TARGET, axis=1)
+    assert (distances > 0.9).all(), "it stays with the cameras"
+    few = Poses(poses.train[:2], poses.test, poses.points)
+    assert paths.through_training_views(few, 3)[[0, 2]] == pytest.approx(few.train)
+    one = Poses(poses.train[:1], poses.test, poses.points)
+    assert paths.through_training_views(one, 2) == pytest.approx(one.train.repeat(2, axis=0))
+
+
 def llffs_spiral(poses: Poses, views: int) -> tuple[Array, Array]:
     """Positions and backward axes of `render_path_spiral`, in LLFF's axes right, up, backward."""
     c2w = np.linalg.inv(poses.train)[:, :3] * np.array([1, -1, -1, 1])  # columns: r, u, b, place

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 from xrgs.capture import images
@@ -22,10 +21,14 @@ from xrgs.capture.masks import MASKS
 from xrgs.capture.own_cameras import other_cameras
 from xrgs.runtime.machine import usable_cores
 from xrgs.runtime.progress import ProgressBar
+from xrgs.runtime.signals import handlers_kept
 from xrgs.runtime.text import listed
 
 if TYPE_CHECKING:
     from xrgs.config import SfmConf
+
+with handlers_kept():
+    import pycolmap
 
 #: The number of features in all images with which exhaustive matching takes minutes on two cores.
 _TOTAL_FEATURES = 100_000

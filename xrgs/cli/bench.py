@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from xrgs.bench.settings import Settings
 from xrgs.cli import options
-from xrgs.runtime.machine import set_passive_openmp_wait
 from xrgs.runtime.streams import say
 
 
@@ -21,5 +20,4 @@ def bench(settings: Settings) -> None:
 
 def main() -> None:
     """Run `xrgs-bench`."""
-    set_passive_openmp_wait()  # as in training
     options.run("xrgs-bench", bench)

@@ -10,7 +10,6 @@ from tyro.conf import Positional, arg
 from xrgs.cli import options
 from xrgs.cli.options import STORE, Cells, Folder, shown_as
 from xrgs.experiment.store import Store
-from xrgs.runtime.machine import set_passive_openmp_wait
 from xrgs.runtime.signals import exit_on_signal
 from xrgs.runtime.streams import say
 
@@ -20,7 +19,10 @@ _CHOICES = {"yes": True, "no": False, None: None}
 
 def render(
     cells: Positional[Cells],
-    path: Literal["orbit", "spiral", "test"] = "orbit",
+    path: Annotated[
+        Literal["orbit", "training", "spiral", "test"] | None,
+        shown_as("orbit|training|spiral|test"),
+    ] = None,
     views: int = 120,
     out: Annotated[Path, arg(metavar="FILE.mp4|FOLDER")] = Path("film.mp4"),
     size: Annotated[tuple[int, int] | None, shown_as("WIDTH HEIGHT")] = None,
@@ -33,9 +35,11 @@ def render(
     Args:
         cells: One cell or two, each by its id, the beginning of its id, the name of a scene with
             one done cell, or a file: .ply, .glb or .spz.
-        path: The path, fitted to the training cameras. `orbit` circles around the point that they
-            look at; where they see it from one side alone, it swings over the arc that they span.
-            `spiral` is LLFF's, for forward-facing scenes. `test` goes through the test cameras in
+        path: The path, fitted to the training cameras; by default `orbit`, or `training` where an
+            orbit would leave the space that they see, as in a room seen from inside. `orbit`
+            circles around the point that they look at; where they see it only from one side, it
+            swings over the arc that they span. `training` goes along them in their order. `spiral`
+            is LLFF's, for forward-facing scenes. `test` goes through the test cameras in
             their order. On every path, all frames have the focal length of the first one.
         views: Number of frames.
         out: An .mp4 file, which needs PyAV (pip install 'xrgs[video]'), or a new folder for PNG
@@ -58,5 +62,4 @@ def render(
 
 def main() -> None:
     """Run `xrgs-render`."""
-    set_passive_openmp_wait()  # as in training
     options.run("xrgs-render", render)

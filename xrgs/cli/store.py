@@ -13,7 +13,6 @@ from xrgs.cli import options
 from xrgs.cli.options import STORE, Cells, Flag, Folder, Names, shown_as
 from xrgs.errors import XrgsError
 from xrgs.experiment.store import Store
-from xrgs.runtime.machine import set_passive_openmp_wait
 from xrgs.runtime.signals import exit_on_signal
 from xrgs.runtime.streams import say
 from xrgs.safeio.sanitize import counted
@@ -222,7 +221,6 @@ def rescore(cells: Filter, also: Names = ()) -> None:
     """
     from xrgs.experiment import rescoring
 
-    set_passive_openmp_wait()
     _, chosen = cells.chosen()
     done = [cell.folder for cell in chosen if cell.folder.status_file.exists()]
     scored = rescoring.rescore(Store(cells.store), done, also)

@@ -24,7 +24,7 @@ from xrgs.cli.options import STORE, Flag, Folder, OptionalFolder, shown_as
 from xrgs.cli.photographs import as_they_are, last_of_each_key
 from xrgs.errors import StoreError, XrgsError
 from xrgs.experiment.store import BASELINE, Store
-from xrgs.runtime.machine import set_passive_openmp_wait, usable_cores
+from xrgs.runtime.machine import usable_cores
 from xrgs.runtime.signals import exit_on_signal
 from xrgs.runtime.streams import say
 from xrgs.runtime.text import format_duration
@@ -217,7 +217,6 @@ def _recipe(names: str) -> list[str]:
 
 def _measured_unit(conf: Conf) -> float:
     """Measure how quickly this machine trains: seconds a step, for each pixel and Gaussian."""
-    set_passive_openmp_wait()  # before torch is loaded
     from xrgs.bench.speed import seconds_per_unit
 
     return seconds_per_unit(conf.threads or usable_cores(), conf.splat.backend)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+import re
 import sys
 from datetime import UTC, datetime
 from functools import cache
@@ -99,6 +100,11 @@ def machine(made: Provenance) -> str:
     """Return what a cell's times depend on, for example `AMD EPYC, avx2, threads 1, native`."""
     parts = (made.cpu, made.gpu, made.instruction_set, f"threads {made.threads}", made.backend)
     return ", ".join(filter(None, parts))
+
+
+def without_threads(name: str) -> str:
+    """Return the name of a machine, as `machine` gives it, without the number of threads."""
+    return re.sub(r", threads \d+", "", name)
 
 
 def processor(made: Provenance) -> str:

@@ -64,7 +64,8 @@ class Store:
         >>> sorted(cells["label"])
         ['baseline', 'baseline', 'consistency', 'consistency']
         >>> store = Store("xrgs-store")
-        >>> gaussians = load_ply(store.cell(cells["cell_id"][0]).path / "splats.ply")
+        >>> file = store.cell(cells["cell_id"][0]).path / "splats.ply"
+        >>> gaussians = load_gaussians(file).gaussians
     """
 
     path: Path

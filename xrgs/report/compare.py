@@ -38,6 +38,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
+from xrgs.experiment.provenance import without_threads
 from xrgs.experiment.store import BASELINE
 from xrgs.report.averages import averaged
 from xrgs.report.collect import ReportError
@@ -45,6 +46,7 @@ from xrgs.report.inference import (
     ALL_HR,
     OTHER_CODE,
     OTHER_MACHINE,
+    OTHER_THREADS,
     difference,
     equivalence,
     false_discovery_rates,
@@ -117,8 +119,9 @@ class Comparison:
     groups: tuple[tuple[str, str], ...]
     """(label, condition) of each label but the base, in the sweep's order."""
     cells: pd.DataFrame
-    """`Sweep.cells` with `base_id`, the cell that each is compared with, and `elsewhere`, whether
-    another machine has trained that cell, as far as is known. The reason of an ablation without a
+    """`Sweep.cells` with `base_id`, the cell that each is compared with, and `elsewhere`, why their
+    times can't be compared: another machine has trained that cell, as far as is known, or this one
+    with another number of threads; empty where they can. The reason of an ablation without a
     finished base says so."""
     pairs: pd.DataFrame
     """One row for each metric of each ablation's cell: `base`, `value`, `effect` (their difference
@@ -245,8 +248,17 @@ def _with_base(cells: pd.DataFrame, against: str) -> pd.DataFrame:
     base_id = base_id.where(cells["label"] != against, cells["cell_id"])
     machines = cells.drop_duplicates("cell_id").set_index("cell_id")["machine"]
     machine, of_base = cells["machine"], base_id.map(machines).astype(object).fillna("")
-    elsewhere = (machine != of_base) & (machine != "") & (of_base != "")
+    pairs = zip(machine, of_base, strict=True)
+    elsewhere = pd.Series([_elsewhere(*pair) for pair in pairs], cells.index, object)
     return cells.assign(base_id=base_id, elsewhere=elsewhere)
+
+
+def _elsewhere(machine: str, of_base: str) -> str:
+    """Say why times of two machines, as `provenance.machine` names them, can't be compared."""
+    if machine == of_base or not (machine and of_base):
+        return ""
+    alike = without_threads(machine) == without_threads(of_base)
+    return OTHER_THREADS if alike else OTHER_MACHINE
 
 
 def _check_comparable(cells: pd.DataFrame, against: str) -> None:
@@ -339,12 +351,13 @@ def _pairs(cells: pd.DataFrame, metrics: Sequence[Metric], against: str) -> pd.D
 
 def _incomparable(
     metric: Metric, paired: pd.DataFrame, matched: pd.DataFrame
-) -> tuple[NDArray[np.bool_], str]:
+) -> tuple[NDArray[np.bool_], str | NDArray[np.str_]]:
     """Return which pairs have values of a metric that can't be compared, and why."""
     if score := scored_by(metric):
         code = f"{score}_code"
         return paired[code].to_numpy(str) != matched[code].to_numpy(str), OTHER_CODE
-    return paired["elsewhere"].to_numpy(bool) & (metric.unit in _TIMES), OTHER_MACHINE
+    why = paired["elsewhere"].to_numpy(str)
+    return (why != "") & (metric.unit in _TIMES), why
 
 
 def _gaps(

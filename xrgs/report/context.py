@@ -13,6 +13,7 @@ import pandas as pd
 
 from xrgs.capture.degradations import DEGRADATIONS, resolve_degradation
 from xrgs.report.inference import OTHER_CODE
+from xrgs.report.photographs import alike
 from xrgs.report.writing import signed
 from xrgs.runtime.text import listed
 from xrgs.safeio.sanitize import counted, for_line
@@ -78,10 +79,12 @@ def contexts(sweep: Sweep) -> dict[str, Context]:
         }
         made = [sweep.done[cell_id] for cell_id in rows["cell_id"]]
         configs = [cell.config for cell in made]
+        reports = [sweep.variants.get(name) for name in rows["variant_id"]]
+        tagged = not all(report and alike(report) for report in reports)
         held_out = bool((rows["validation"] > 0).any())
         found[str(condition)] = Context(
             (
-                *_sizes([config for config in configs if config]),
+                *_sizes([config for config in configs if config], tagged=tagged),
                 _scored_views(tests, held_out=held_out),
                 *_prune_rule(zip(rows["label"], configs, strict=True)),
             ),
@@ -103,13 +106,17 @@ def _shown(value: float | str) -> str:
     return for_line(value if isinstance(value, str) else f"{value:,g}", _MAX_SHOWN)
 
 
-def _sizes(configs: Sequence[Conf]) -> list[str]:
-    """Return phrases on steps, size and mixture."""
+def _sizes(configs: Sequence[Conf], *, tagged: bool) -> list[str]:
+    """Return phrases on steps and size and, where HR and LR tell something, on the mixture."""
     if not configs:
         return []
     sizes = _distinct(config.variant.long_side for config in configs)
+    steps = f"{_distinct(config.train.steps for config in configs)} steps"
+    if not tagged:
+        size = "at their own size" if sizes == "0" else f"of at most {sizes} px"
+        return [steps, f"photographs {size}"]
     return [
-        f"{_distinct(config.train.steps for config in configs)} steps",
+        steps,
         "HR views at the photographs' size" if sizes == "0" else f"HR views of at most {sizes} px",
         " or ".join(dict.fromkeys(_mixture(config.variant) for config in configs)),
     ]

@@ -128,7 +128,7 @@ def times(cells: pd.DataFrame, done: Mapping[str, DoneCell]) -> pd.DataFrame:
         row = dict(cell[CELL_KEYS]) | {"target": end["psnr"]}
         for name in ("evaluations", "seconds"):
             row[name], own = (_first_passage(of, name, end["psnr"]) for of in (curve, base.curve))
-            comparable = not (cell["elsewhere"] and name == "seconds")
+            comparable = not cell["elsewhere"] or name != "seconds"
             for share, whole in (("share", end[name]), ("own_share", own)):
                 known = comparable and whole > 0
                 row[f"{name}_{share}"] = row[name] / whole if known else math.nan

@@ -24,6 +24,7 @@ MIN_VALUES = 3
 LEVEL = 0.05
 NOT_MEASURED = "not measured"
 OTHER_MACHINE = "timed on another machine"
+OTHER_THREADS = "timed with another number of threads"
 OTHER_CODE = "scored by other code"
 NOT_FINITE = "not finite"
 NOT_POSITIVE = "not above zero"

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from xrgs.capture.folders import TO_TRY
 from xrgs.evaluation.metrics import METRICS
 from xrgs.evaluation.scoring import PROTOCOL
-from xrgs.experiment.provenance import MACHINE_KEYS
+from xrgs.experiment.provenance import MACHINE_KEYS, without_threads
 from xrgs.experiment.store import BASELINE, Store
 from xrgs.report import curves, work
 from xrgs.report.collect import CELL_KEYS, RECORD_KEYS, ReportError, Sweep, read_cells
@@ -269,14 +269,15 @@ def _csv(table: pd.DataFrame) -> str:
 
 
 def _change_tables(tables: Tables) -> list[TextTable]:
-    """Return every table of changes and values, overviews first."""
+    """Return every table of changes and values: first what is missing, then overviews."""
     comparison = tables.comparison
-    result = [*_overviews(tables), legend(comparison), *_ablation_tables(tables)]
+    overviews, own = _overviews(tables), _ablation_tables(tables)
+    result = [*overviews, legend(comparison, [*overviews, *own]), *own]
     conditions = dict.fromkeys(comparison.cells["condition"])
     result += [tables.scores(name) for name in conditions]
     result += [tables.values(name) for name in conditions]
     missing = tables.missing()
-    return result + ([missing] if missing else [])
+    return [missing, *result] if missing else result
 
 
 def _overviews(tables: Tables) -> list[TextTable]:
@@ -370,9 +371,11 @@ def _warnings(sweep: Sweep) -> list[str]:
         )
     machines = sorted(set(sweep.cells["machine"]) - {""})
     if len(machines) > 1:
+        alike = len({*map(without_threads, machines)}) == 1
+        how = "with different numbers of threads" if alike else "on different machines"
         warnings.append(
-            f"The cells were trained on different machines ({'; '.join(machines)}): times are"
-            " compared between cells of one machine alone."
+            f"The cells were trained {how} ({'; '.join(machines)}): times are compared only between"
+            f" cells of {'one number of threads' if alike else 'one machine'}."
         )
     arithmetics = sweep.provenance.get("arithmetic", ())
     if len(arithmetics) > 1:
@@ -411,14 +414,14 @@ def _text(tables: Tables, warnings: list[str]) -> str:
     if len(comparison.groups) <= _MAX_PRINTED_ABLATIONS:
         printed += _ablation_tables(tables)
     if comparison.groups:
-        printed.append(legend(comparison))
+        printed.append(legend(comparison, printed))
     else:
         printed += [tables.values(name) for name in dict.fromkeys(comparison.cells["condition"])]
-    missing = tables.missing()
-    if missing:
+    if missing := tables.missing():
         more = len(missing.rows) - _MAX_PRINTED_MISSING
         notes = (*missing.notes, *([f"and {more} more, in table.md"] if more > 0 else []))
-        printed.append(replace(missing, rows=missing.rows[:_MAX_PRINTED_MISSING], notes=notes))
+        first = replace(missing, rows=missing.rows[:_MAX_PRINTED_MISSING], notes=notes)
+        printed.insert(0, first)
     return "\n".join(
         [*(to_text(table) for table in printed if table.rows), *map(for_line, warnings)]
     )

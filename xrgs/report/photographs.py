@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 #: The most names in a sentence on views that are not placed: all that a scene is likely to have.
 _MAX_NAMES = 200
+#: How the note begins that photographs, which are not degraded, differ too little for HR and LR.
+_MEANINGLESS = "the split by variant.tags="
 
 
 def with_variants(sweep: Sweep, store: JoinedStore) -> Sweep:
@@ -49,6 +51,32 @@ def photographs(sweep: Sweep) -> list[tuple[str, tuple[str, ...]]]:
         notes = [note for variant in variants for note in variant.all_notes(_MAX_NAMES)]
         found.append((str(scene), tuple(dict.fromkeys([*notes, *_found(sweep, rows)]))))
     return [(scene, notes) for scene, notes in found if notes]
+
+
+def alike(report: SfmReport) -> bool:
+    """Return whether a scene's photographs are of one resolution, so that HR and LR tell nothing.
+
+    Args:
+        report: The report of a variant. Degraded photographs are never alike.
+    """
+    if report.degradation != "none":
+        return bool(report.hr) and not report.lr
+    return not (report.hr and report.lr) or any(n.startswith(_MEANINGLESS) for n in report.notes)
+
+
+def placement(sweep: Sweep, scene: str) -> str:
+    """Say how the photographs of a scene were placed, from the report of its first variant."""
+    rows = sweep.cells[(sweep.cells["scene"] == scene)]
+    reports = [sweep.variants[name] for name in rows["variant_id"] if name in sweep.variants]
+    if not reports or not reports[0].images:
+        return "not known, how the photographs were placed"
+    report = reports[0]
+    by = "structure from motion" if report.poses is None else "the cameras that were given"
+    error = report.reprojection_error_px
+    parts = [f"{report.registered} of {report.images} photographs are placed by {by}"]
+    parts += [f"{report.points:,} points"] if report.points else []
+    parts += [] if error is None else [f"mean reprojection error {error:.2f} px"]
+    return ", ".join(parts)
 
 
 def _found(sweep: Sweep, rows: pd.DataFrame) -> Iterator[str]:

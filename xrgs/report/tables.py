@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from xrgs.report.compare import is_ratio
 from xrgs.report.context import context_of
 from xrgs.report.inference import ALL_HR
 from xrgs.report.markup import filled, titled
@@ -19,6 +18,7 @@ from xrgs.report.writing import (
     SAME,
     Change,
     by_key,
+    change_unit,
     interval,
     lacking,
     marked,
@@ -29,6 +29,7 @@ from xrgs.report.writing import (
     same_sign,
     signed,
     verdict,
+    with_unit,
 )
 from xrgs.runtime.text import TextTable
 
@@ -216,6 +217,8 @@ class Tables:
         for metric in () if self.unchanged(label, condition) else self.comparison.metrics:
             found = [self._per_scene.get((label, condition, s, metric.name)) for s in scenes]
             mean = self._means.get((label, condition, metric.name))
+            if not any(found):  # nothing is done: `missing` says why
+                continue
             cells = [
                 *(MISSING if row is None else pointed(row.change, metric) for row in found),
                 marked(mean, metric, len(scenes)),
@@ -232,14 +235,17 @@ class Tables:
         )
 
     def values(self, condition: str) -> TextTable:
-        """Return a table of each label's own values, means over the replicates that are done."""
+        """Return a table of each label's own values, means over the replicates that are done.
+
+        A scene without a cell that is done has no rows: `missing` says why.
+        """
         cells = self.comparison.cells
         done = cells[(cells["state"] == "done") & (cells["condition"] == condition)]
         labels = list(dict.fromkeys(cells.loc[cells["condition"] == condition, "label"]))
         names = [metric.name for metric in self.comparison.metrics]
         means = done.groupby(["scene", "label"])[names].mean().to_dict("index")
         rows = []
-        for scene in self.comparison.scenes:
+        for scene in sorted(done["scene"].unique()):
             for metric in self.comparison.metrics:
                 found = [means.get((scene, label)) for label in labels]
                 texts = [MISSING if v is None else number(v[metric.name], metric.unit)
@@ -390,7 +396,7 @@ class Tables:
         table["verdict"] = [verdict(r, m) for r, m in zip(rows, of, strict=True)]
         table["agree"] = [row.agree for row in rows]
         table["metric_unit"] = [m.unit for m in of]
-        table["change_unit"] = ["%" if is_ratio(m) else m.unit for m in of]
+        table["change_unit"] = [*map(change_unit, of)]
         table["against"] = self.comparison.base
         table["higher_is_better"] = [m.higher_is_better for m in of]
         table = table.rename(columns={"n": "n_values", "unit": "n_of", "holm": "p_holm"})
@@ -438,10 +444,10 @@ def _mean_row(row: Change, metric: Metric, scenes: int, said: str) -> tuple[str,
     """
     read = verdict(row, metric)
     return (
-        named(metric),
+        metric.label,
         number(row.base, metric.unit),
         number(row.value, metric.unit),
-        f"{pointed(row.change, metric)}{lacking(row, scenes)}",
+        f"{with_unit(row.change, metric)}{lacking(row, scenes)}",
         interval(row.low, row.high),
         interval(row.new_low, row.new_high),
         same_sign(row),

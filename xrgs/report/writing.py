@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import TYPE_CHECKING, NamedTuple
 
 from xrgs.report.compare import is_ratio
@@ -10,6 +11,8 @@ from xrgs.report.inference import LEVEL, MIN_VALUES
 from xrgs.runtime.text import TextTable
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import pandas as pd
 
     from xrgs.evaluation.metrics import Metric
@@ -111,12 +114,23 @@ def arrow(change: float, metric: Metric) -> str:
 
 def named(metric: Metric) -> str:
     """Return the name of a metric with the unit of its changes: `PSNR, dB` or `LPIPS, %`."""
-    return f"{metric.label}, {'%' if is_ratio(metric) else metric.unit}"
+    return f"{metric.label}, {change_unit(metric)}"
+
+
+def change_unit(metric: Metric) -> str:
+    """Return the unit of a metric's changes."""
+    return "%" if is_ratio(metric) else metric.unit
 
 
 def pointed(change: float, metric: Metric) -> str:
     """Write a change with its arrow as the paper's tables do: `-44.57 ↑`."""
     return f"{signed(change)} {arrow(change, metric)}"
+
+
+def with_unit(change: float, metric: Metric) -> str:
+    """Write a change with its unit and arrow, beside values of another unit: `-44.57 % ↑`."""
+    unit = "" if math.isnan(change) else f" {change_unit(metric)}"
+    return f"{signed(change)}{unit} {arrow(change, metric)}"
 
 
 def verdict(row: Change, metric: Metric) -> str:
@@ -184,33 +198,53 @@ def same_sign(row: Change) -> str:
     return f"{row.agree} of {row.n} ({p_value(row.p_sign)})" if row.n > 1 else ""
 
 
-def legend(comparison: Comparison) -> TextTable:
-    """Return the table that says what the columns and marks of the tables of changes mean."""
+def legend(comparison: Comparison, tables: Sequence[TextTable]) -> TextTable:
+    """Return the table that says what the columns and marks of tables of changes mean.
+
+    Args:
+        comparison: The comparison that the tables are of.
+        tables: The tables: a column or mark that none of them has is left out.
+    """
     design, base = comparison.design, comparison.base
     outcomes = ", ".join(m.label for m in comparison.metrics if m.name in design.outcomes)
+    # Each term with what it stands as: the head of a column, or what a cell's text matches.
     rows = (
-        ("change", f"mean over scenes of the means over replicates: the difference from {base} in"
-                   f" dB, or the mean log(value / {base}) in percent"),
-        (f"{BETTER} {WORSE} {SAME}", "improvement, degradation, no change at this precision"),
-        ("(3 of 4)", "beside a mean: it is over 3 of the 4 scenes"),
-        ("95 % interval", "Student's t over the scenes' means; of one scene, over its replicates"),
-        ("new scene", "95 % prediction interval of one more scene like these: of the mean over its"
-                      " replicates"),
-        ("same sign (p)", "scenes that change as their mean does, and the p of the exact sign"
-                          " test; of one scene, replicates"),
-        ("q", "Benjamini and Hochberg's rate of false discoveries, from the t-tests of the"
-              f" outcomes of all ablations of a condition, of at least {MIN_VALUES} values; amounts"
-              " are corrected apart from scores"),
-        *((("p (Holm)", f"the p of {', '.join(design.headline)}, corrected by Holm instead of q"),)
-          if design.headline else ()),
-        ("better, worse *", f"q, or the p of Holm, is at most {LEVEL:g}"),
-        ("equivalent ≈", f"the change is within {design.margin_psnr:g} dB of PSNR or"
-                         f" {design.margin_lpips:g} % of LPIPS: p of two one-sided t-tests (TOST)"
-                         f" is at most {LEVEL:g}"),
-        ("not shown", "neither of them"),
-        ("descriptive", f"without a verdict: the outcomes of this report are {outcomes}"),
+        ("change", "", rf" [{BETTER}{WORSE}{SAME}]",
+         f"mean over scenes of the means over replicates: the difference from {base} in dB, or the"
+         f" mean log(value / {base}) in percent"),
+        (f"{BETTER} {WORSE} {SAME}", "", rf" [{BETTER}{WORSE}{SAME}]",
+         "improvement, degradation, no change at this precision"),
+        ("(3 of 4)", "", r"\(\d+ of \d+\)$", "beside a mean: it is over 3 of the 4 scenes"),
+        ("95 % interval", "95 % interval", "",
+         "Student's t over the scenes' means; of one scene, over its replicates"),
+        ("new scene", "new scene", "",
+         "95 % prediction interval of one more scene like these: of the mean over its replicates"),
+        ("same sign (p)", "same sign (p)", "",
+         "scenes that change as their mean does, and the p of the exact sign test; of one scene,"
+         " replicates"),
+        ("q", "q", r" \*( |$)",
+         "Benjamini and Hochberg's rate of false discoveries, from the t-tests of the outcomes of"
+         f" all ablations of a condition, of at least {MIN_VALUES} values; amounts are corrected"
+         " apart from scores"),
+        ("p (Holm)", "p (Holm)", "",
+         f"the p of {', '.join(design.headline)}, corrected by Holm instead of q"),
+        ("better, worse *", "", r"^(better|worse)$| \*( |$)",
+         f"q, or the p of Holm, is at most {LEVEL:g}"),
+        ("equivalent ≈", "", r"^equivalent$| ≈( |$)",
+         f"the change is within {design.margin_psnr:g} dB of PSNR or {design.margin_lpips:g} % of"
+         f" LPIPS: p of two one-sided t-tests (TOST) is at most {LEVEL:g}"),
+        ("not shown", "", "^not shown$", "neither better, nor worse, nor equivalent by its tests"),
+        ("descriptive", "", "^descriptive$",
+         f"without a verdict: the outcomes of this report are {outcomes}"),
     )  # fmt: skip
-    return TextTable("How to read the tables", ("", "meaning"), rows, "ll")
+    heads = {head for table in tables for head in table.columns}
+    texts = {text for table in tables for row in table.rows for text in row}
+    found = tuple(
+        (term, meaning)
+        for term, head, mark, meaning in rows
+        if head in heads or (mark and any(re.search(mark, text) for text in texts))
+    )
+    return TextTable("How to read the tables", ("", "meaning"), found, "ll", prose=True)
 
 
 def by_key(table: pd.DataFrame) -> dict[tuple[str, ...], Change]:

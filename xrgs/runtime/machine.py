@@ -99,16 +99,6 @@ def peak_rss() -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
 
 
-def set_passive_openmp_wait() -> None:
-    """Make OpenMP's threads sleep between parallel loops; call this before torch is imported.
-
-    A value of OMP_WAIT_POLICY that is already in the environment is kept.
-    """
-    # torch's threads are OpenMP's. By default they spin for milliseconds after each loop, on cores
-    # that the native kernels need then: on two busy cores a step took three times as long.
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-
-
 def set_portable_blas(cpuinfo: Path = Path("/proc/cpuinfo")) -> None:
     """Make OpenBLAS of child processes, in numpy and pycolmap, compute with AVX2 where there is.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import signal
 import sys
 from contextlib import contextmanager
@@ -44,6 +45,34 @@ def exit_on_signal(hint: str) -> Iterator[None]:
     except StopSignal as stop:
         say(f"stopped by {signal.Signals(stop.number).name}. {hint}", sys.stderr)
         sys.exit(128 + stop.number)
+
+
+#: Signals that a library may take for its report of a crash, as COLMAP's does.
+_OF_CRASHES = (
+    *(signal.SIGABRT, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGSEGV),
+    signal.SIGTERM,
+)
+#: More bytes than `struct sigaction` has on any system.
+_SIGACTION_BYTES = 512
+
+
+@contextmanager
+def handlers_kept() -> Iterator[None]:
+    """Give the handlers of signals back that a library takes during a block, Python's or not.
+
+    SIGTERM waits meanwhile: the library's handler prints a stack.
+    """
+    libc = ctypes.CDLL(None)
+    before = {number: ctypes.create_string_buffer(_SIGACTION_BYTES) for number in _OF_CRASHES}
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
+    for number, action in before.items():
+        libc.sigaction(number, None, action)
+    try:
+        yield
+    finally:
+        for number, action in before.items():
+            libc.sigaction(number, action, None)
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 class StopRequest:

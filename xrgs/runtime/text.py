@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import unicodedata
 from dataclasses import dataclass
+from textwrap import wrap
 from typing import TYPE_CHECKING
 
 from xrgs.safeio.sanitize import MAX_CELL, for_line
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
+#: The longest line of a table of sentences on a terminal, in columns.
+_MAX_WIDTH = 100
 
 
 def format_size(count: float | None) -> str:
@@ -69,6 +73,8 @@ class TextTable:
     """Headings over the columns, from the left, with how many each is over; empty for none."""
     best: frozenset[tuple[int, int]] = frozenset()
     """Row and column of the cells that Markdown and LaTeX print bold."""
+    prose: bool = False
+    """Whether the last column has sentences, which a terminal and the page wrap."""
 
     @property
     def heads(self) -> tuple[str, ...]:
@@ -82,11 +88,26 @@ class TextTable:
 
 def to_text(table: TextTable) -> str:
     """Write a table for a terminal: aligned lines under the title, with the notes below."""
-    lines, sizes = padded([one_line(row) for row in (table.heads, *table.rows)], table.align)
+    rows = [one_line(row) for row in (table.heads, *table.rows)]
+    if table.prose:
+        rows = _wrapped(rows)
+    lines, sizes = padded(rows, table.align)
     lines.insert(1, ["─" * size for size in sizes])
     body = ["  ".join(line).rstrip() for line in lines]
     head = [for_line(text) for text in (table.title, table.context) if text]
     return "\n".join([*head, "", *body, *map(for_line, table.notes), ""])
+
+
+def _wrapped(rows: Sequence[tuple[str, ...]]) -> list[tuple[str, ...]]:
+    """Return rows whose last text is wrapped to rows below it, so that no line is too long."""
+    *columns, _ = zip(*rows, strict=True)
+    room = _MAX_WIDTH - sum(max(3, *map(width, column)) + 2 for column in columns)
+    found = []
+    for *others, text in rows:
+        first, *more = wrap(text, room) or [""]
+        found.append((*others, first))
+        found += [(*[""] * len(others), line) for line in more]
+    return found
 
 
 def one_line(row: Sequence[str]) -> tuple[str, ...]:

@@ -25,7 +25,7 @@ _INVISIBLE = re.compile(
 #: after which a spreadsheet reads a formula. The wide ones are read like those of ASCII.
 _FORMULA = re.compile(r"(^|;\s*)(?=[=+\-@＝＋－＠])")
 #: A number with its sign, as tables print it; the arrow says whether a change is an improvement.
-_NUMBER = re.compile(r"[+-]?\d[\d,.]*(e[+-]?\d+)?( [↑↓=])?", re.ASCII)
+_NUMBER = re.compile(r"[+-]?\d[\d,.]*(e[+-]?\d+)?( (%|dB))?( [↑↓=])?", re.ASCII)
 _MARKDOWN = str.maketrans(
     {char: f"\\{char}" for char in "\\`*_{}[]#|~$"}
     | {"&": "&amp;", "<": "&lt;", ">": "&gt;"}
@@ -47,7 +47,14 @@ _LATEX = str.maketrans(
         "]": "{]}",
         "↑": r"$\uparrow$",
         "↓": r"$\downarrow$",
+        "≈": r"$\approx$",
+        "−": "$-$",
     }
+)
+#: Characters beyond those that pdflatex sets in its default font: Latin with accents that the font
+#: has, and signs of the companion font. A run of others stops it.
+_NOT_PDFLATEX = re.compile(
+    "[^\x00-\x7f¡-ª¬-º¼-ÏÑ-Ýß-ïñ-ýÿĀ-ăĆ-ďĒ-ėĚ-ĥĨ-ĭİ-ķĹ-ľŁ-ňŌ-ťŨ-űŴ-žȘ-ț‐-‖‘’“”†‡•…€™]+"
 )
 
 
@@ -111,12 +118,19 @@ def for_markdown(text: str) -> str:
 
 
 def for_latex(text: str) -> str:
-    """Escape a text so that LaTeX shows it as it is; scripts other than Latin need xelatex.
+    """Escape a text so that LaTeX shows it as it is.
 
     Args:
-        text: Any text; the hyphen of a negative number becomes a minus sign.
+        text: Any text; the hyphen of a negative number becomes a minus sign. pdflatex shows a
+            character that it has no font for by its number, `U+90E8`; xelatex and lualatex show it.
     """
-    return re.sub(r"(?<!\S)-(?=\d)", "$-$", for_line(text).strip().translate(_LATEX))
+    escaped = re.sub(r"(?<!\S)-(?=\d)", "$-$", for_line(text).strip().translate(_LATEX))
+    return _NOT_PDFLATEX.sub(_by_number_in_pdflatex, escaped)
+
+
+def _by_number_in_pdflatex(found: re.Match[str]) -> str:
+    numbers = " ".join(f"U+{ord(char):04X}" for char in found[0])
+    return rf"\ifdefined\Umathchar {found[0]}\else {numbers}\fi{{}}"
 
 
 def for_file_name(text: str) -> str:

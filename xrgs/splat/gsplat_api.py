@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 import torch
 from torch.nn.functional import pad
 
+import xrgs
 from xrgs.splat.cameras import Camera
 from xrgs.splat.rendering import backend_for, rasterize_parameters
 from xrgs.splat.settings import RasterSettings
@@ -168,6 +169,7 @@ def rasterization(
         >>> image.shape, alpha.shape
         (torch.Size([1, 32, 48, 3]), torch.Size([1, 32, 48, 1]))
     """
+    xrgs.warn_of_spinning()
     _refuse(
         sparse_grad=sparse_grad,
         distributed=distributed,
@@ -227,7 +229,7 @@ def _refuse(**given: bool) -> None:
     for name, is_given in given.items():
         if is_given:
             raise NotImplementedError(
-                f"{name}: xrgs.rasterization serves only its default; leave it out"
+                f"{name}: rasterization serves only its default; leave it out"
             )
 
 
@@ -320,7 +322,7 @@ def _cameras(viewmats: Tensor, Ks: Tensor, width: int, height: int) -> list[Came
     for name, matrices in (("viewmats", viewmats), ("Ks", Ks)):
         if matrices.requires_grad and torch.is_grad_enabled():
             raise NotImplementedError(
-                f"{name}: xrgs.rasterization gives no gradients of cameras; use {name}.detach()"
+                f"{name}: rasterization gives no gradients of cameras; use {name}.detach()"
             )
     cameras = []
     for index, (viewmat, K) in enumerate(zip(viewmats.detach(), Ks.detach(), strict=True)):
@@ -452,7 +454,7 @@ class _Renderer(NamedTuple):
             layers += self._features(shapes, values, camera, offset)
         if self.settings.absgrad and len(layers) > 1:
             raise NotImplementedError(
-                f"absgrad: xrgs.rasterization serves it for up to three channels, "
+                f"absgrad: rasterization serves it for up to three channels, "
                 f"not for this render_mode={self.render_mode!r} and colors"
             )
         image = torch.cat([layer for layer, _ in layers], dim=-1)

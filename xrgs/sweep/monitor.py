@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from statistics import fmean
 from typing import TYPE_CHECKING, Any, Self
 
@@ -26,7 +26,7 @@ from xrgs.safeio.files import list_names
 from xrgs.safeio.sanitize import for_line
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
     from xrgs.runtime.progress import Progress
@@ -84,6 +84,9 @@ class SweepSnapshot:
     """The most cells that this sweep was seen to train at once."""
     slowness: float = 1.0
     """The time that this sweep's cells took, relative to their estimates."""
+    shares: Mapping[str, float] = field(default_factory=dict)
+    """The share of its steps that each cell had done when it was last seen in training. A cell has
+    no progress file for a moment before it is done, and then waits by its files."""
 
     @property
     def ended(self) -> int:
@@ -98,7 +101,7 @@ class SweepSnapshot:
     @property
     def left_s(self) -> float | None:
         """Expected seconds left, if as many cells run at once as did so far; None if unknown."""
-        waiting = (self.expected_s(cell, cell.trained) for cell in self.waiting)
+        waiting = (self.expected_s(cell, self.trained(cell)) for cell in self.waiting)
         own = [*waiting, *map(self.rest_s, self.running)]
         known = [seconds for seconds in own if seconds is not None]
         if len(known) < len(own):
@@ -106,6 +109,16 @@ class SweepSnapshot:
         others = [seconds for cell in self.elsewhere if (seconds := self.rest_s(cell))]
         longest = max([*known, *others], default=None)
         return longest and max(longest, sum(known) / self.at_once)
+
+    @property
+    def progress(self) -> float:
+        """Number of cells that have ended, with the shares of the others."""
+        waiting = (self.shares.get(str(cell.cell_id), 0.0) for cell in self.waiting)
+        return self.ended + sum(waiting) + sum(cell.share for cell in self.running)
+
+    def trained(self, cell: PlannedCell) -> float:
+        """Return the share of a waiting cell's steps that is done, as far as is known."""
+        return max(cell.trained, self.shares.get(str(cell.cell_id), 0.0))
 
     def expected_s(self, cell: PlannedCell, trained: float) -> float | None:
         """Return the expected seconds of a cell to its end; None if unknown.
@@ -275,6 +288,7 @@ class SweepMonitor:
             self._pace,
             self._at_once,
             self._slowness.ratio(running),
+            dict(self._shares),
         )
 
     def _running(self, cell: PlannedCell, now: Progress) -> RunningCell:
@@ -338,8 +352,9 @@ class SweepMonitor:
         if self._bar is None:
             style = "{percentage:3.0f}%|{bar:20}| {desc}"
             self._bar = tqdm(None, bar_format=style, leave=False, dynamic_ncols=True, delay=1e-9)
-        self._bar.total = snapshot.total
-        self._bar.n = snapshot.ended + sum(cell.share for cell in snapshot.running)
+        # A training that starts again, as count_matched does, takes nothing back.
+        shown = self._bar.n if self._bar.total == snapshot.total else 0
+        self._bar.total, self._bar.n = snapshot.total, max(shown, snapshot.progress)
         self._bar.set_description_str(str(snapshot))
 
 

@@ -66,7 +66,7 @@ def train_cell(
 
     Examples:
         >>> result = train(data, compose("+ablation=loss_weighting", "train.steps=5"))
-        >>> save_ply("trained.ply", result.gaussians)
+        >>> save_gaussians("trained.ply", result.gaussians)
     """
     count_matched = conf.components.count_matched
     check_not_negative("components.count_matched.gaussians", count_matched.gaussians)

@@ -21,7 +21,7 @@ from xrgs.safeio.files import list_names
 from xrgs.splat.cameras import Camera
 from xrgs.splat.rendering import rasterize
 from xrgs.viewer.models import reference
-from xrgs.viewer.paths import PATHS
+from xrgs.viewer.paths import PATHS, default_path
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -47,7 +47,7 @@ def make_film(
     models: Sequence[Model],
     out: Path,
     *,
-    path: str = "orbit",
+    path: str | None = None,
     views: int = 120,
     size: tuple[int, int] | None = None,
     fps: int = 30,
@@ -59,7 +59,8 @@ def make_film(
     Args:
         models: One model, or several of one world, which are shown side by side with their names.
         out: An .mp4 file, which is replaced, or a folder that is new or empty, for one PNG a frame.
-        path: `orbit`, `spiral` or `test`, see `xrgs.viewer.paths`.
+        path: A name in `xrgs.viewer.paths.PATHS`; None for `orbit`, or for `training` where an
+            orbit would leave the space that the training cameras see.
         views: Number of frames. All have the intrinsics of the first test view.
         size: Width and height of one model's panel, px, both even; None for the size of the first
             test view, without its last row or column where that is odd.
@@ -79,6 +80,7 @@ def make_film(
         raise XrgsError("the path is fitted to the cameras of a cell: give a cell beside the .ply")
     first_test = next(view for view in world.views if view.kind == "test")
     camera = _panel_camera(first_test.camera, size)
+    path = path or default_path(world.poses)
     cameras = [
         Camera(torch.from_numpy(viewmat).float(), camera.K, camera.width, camera.height)
         for viewmat in PATHS[path](world.poses, views)
@@ -90,11 +92,11 @@ def make_film(
         raise XrgsError(f"out={out}: can't be written ({error.strerror or error})") from error
     shown = f"{len(models) * camera.width} x {camera.height} px"
     length = f", {views / fps:.1f} s" if is_film else ""
-    return f"{out}: {views} frames of {shown}{length}"
+    return f"{out}: {views} frames of {shown}{length}, path {path}"
 
 
-def _check(path: str, views: int, fps: int, size: tuple[int, int] | None) -> None:
-    if path not in PATHS:
+def _check(path: str | None, views: int, fps: int, size: tuple[int, int] | None) -> None:
+    if path is not None and path not in PATHS:
         raise XrgsError(f"path={path}: must be one of {', '.join(PATHS)}")
     if not 1 <= views <= _MAX_FRAMES:
         raise XrgsError(f"views={views}: must be from 1 to {_MAX_FRAMES}")

@@ -35,6 +35,11 @@ _MIN_FACING = 0.5
 _RADIUS_PERCENTILE, _DEPTH_PERCENTILES = 90.0, (0.1, 99.9)
 _NEAR_FACTOR, _FAR_FACTOR, _NEAR_WEIGHT = 0.9, 5.0, 0.25
 _TURNS, _AXIAL_RATE = 2, 0.5
+#: Frames between two cameras of the path along the training cameras. Our choice.
+_FRAMES_BETWEEN = 10
+#: Cameras of an orbit that are judged, and the angle to which a training camera looks the same way,
+#: degrees. Our choice.
+_PROBES, _SAME_WAY = 36, 60.0
 
 
 @dataclass(frozen=True)
@@ -132,17 +137,60 @@ def through_test_views(poses: Poses, views: int) -> Array:
     Returns:
         [views, 4, 4] world to camera.
     """
-    count = len(poses.test)
+    return _through(poses.test, views)
+
+
+def through_training_views(poses: Poses, views: int) -> Array:
+    """Move along the training cameras in their order, from the first to the last.
+
+    The path goes through one camera for ten frames, evenly chosen, and between two as
+    `through_test_views` does: through every one of many it would shake.
+
+    Args:
+        poses: What the path is fitted to.
+        views: Number of cameras, at least 1.
+
+    Returns:
+        [views, 4, 4] world to camera.
+    """
+    last = len(poses.train) - 1
+    count = min(last + 1, max(2, 1 + views // _FRAMES_BETWEEN))
+    return _through(poses.train[np.linspace(0, last, count).round().astype(int)], views)
+
+
+def _through(viewmats: Array, views: int) -> Array:
+    """Move through cameras [C, 4, 4] in their order, at equal numbers of steps between two."""
+    count = len(viewmats)
     if count == 1:
-        return np.repeat(poses.test, views, axis=0)
+        return np.repeat(viewmats, views, axis=0)
     keys, times = np.arange(count), np.linspace(0, count - 1, views)
-    positions = PchipInterpolator(keys, camera_positions(poses.test))(times)  # [views, 3]
-    rotations = Slerp(keys, Rotation.from_matrix(poses.test[:, :3, :3]))(times).as_matrix()
+    positions = PchipInterpolator(keys, camera_positions(viewmats))(times)  # [views, 3]
+    rotations = Slerp(keys, Rotation.from_matrix(viewmats[:, :3, :3]))(times).as_matrix()
     return _viewmats(rotations, positions)
+
+
+def default_path(poses: Poses) -> str:
+    """Return `orbit`, or `training` where an orbit would leave the space that the cameras see.
+
+    It stays there if each of its cameras has a training camera that is nearer than the point that
+    they look at, and looks the same way to 60 degrees. Around an object, and in the arc before a
+    forward-facing scene, that holds. In a scene that is seen from inside, the cameras look outwards
+    and an orbit inwards.
+
+    Args:
+        poses: What the path is fitted to.
+    """
+    path = orbit(poses, _PROBES)
+    places, focus = camera_positions(path), look_at_point(poses)
+    apart = np.linalg.norm(places[:, None] - camera_positions(poses.train), axis=2)  # [P, C]
+    near = apart < np.linalg.norm(places - focus, axis=1)[:, None]
+    alike = path[:, 2, :3] @ poses.train[:, 2, :3].T > np.cos(np.radians(_SAME_WAY))
+    return "orbit" if (near & alike).any(axis=1).all() else "training"
 
 
 PATHS: dict[str, Callable[[Poses, int], Array]] = {
     "orbit": orbit,
+    "training": through_training_views,
     "spiral": spiral,
     "test": through_test_views,
 }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -47,18 +48,24 @@ def _view(folder: Path, name: str, split: str, tag: str, number: int) -> View:
     return View(name, file, split, tag, width, height, K, viewmat, width / HR[0])
 
 
-def make_variant(store: Store) -> Variant:
-    """Freeze a variant of two test views and three training views into a store."""
+def make_variant(store: Store, tags: Mapping[str, str] = TRAINING_VIEWS) -> Variant:
+    """Freeze a variant of two test views and three training views into a store.
+
+    Args:
+        store: The store.
+        tags: The tag of each training view; an LR view has an original.
+    """
     folder = store.path / "source"
     views = [_view(folder, name, "test", "HR", at) for at, name in enumerate(TEST_VIEWS)]
-    for at, (name, tag) in enumerate(TRAINING_VIEWS.items(), 2):
+    for at, (name, tag) in enumerate(tags.items(), 2):
         views.append(_view(folder, name, "train", tag, at))
         if tag == "LR":
             views.append(_view(folder, name, "original", "HR", at))
     points = np.random.default_rng(0).normal(0, 1, (50, 3))
+    report = {} if "LR" in tags.values() else {"degradation": "none", "hr": [*tags]}
     views.sort(key=lambda view: (view.split, view.name))
     made = Variant(
-        "id", folder, "fern", 2, True, tuple(views), points, np.zeros((50, 3), np.uint8), {}
+        "id", folder, "fern", 2, True, tuple(views), points, np.zeros((50, 3), np.uint8), report
     )
     return frozen.freeze(made, "0123456789abcdef", folder, store.variants, {})
 
@@ -92,9 +99,22 @@ def page_of(store: Path, out: Path | None = None) -> Path:
 @pytest.fixture(scope="session")
 def pictured(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A store of one scene, with everything that a page shows, and a hostile label."""
-    made = MadeStore(tmp_path_factory.mktemp("pictured") / "store")
-    variant = make_variant(made.store)
-    for seed, label in enumerate(("baseline", "consistency", HOSTILE)):
+    return _pictured(tmp_path_factory.mktemp("pictured") / "store", TRAINING_VIEWS, 3)
+
+
+@pytest.fixture(scope="session", params=["alike", "mixed"])
+def alone(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The page of one cell, of photographs alike or of a mixture; its name says which."""
+    folder = tmp_path_factory.mktemp("alone")
+    tags = TRAINING_VIEWS if request.param == "mixed" else dict.fromkeys(TRAINING_VIEWS, "HR")
+    store = _pictured(folder / "store", tags, 1)
+    return build(store, out=folder / request.param).folder / "report.html"
+
+
+def _pictured(folder: Path, tags: Mapping[str, str], count: int) -> Path:
+    made = MadeStore(folder)
+    variant = make_variant(made.store, tags)
+    for seed, label in enumerate(("baseline", "consistency", HOSTILE)[:count]):
         factors = {"gaussians": 1 - 0.2 * seed, "psnr": 1 + 0.01 * seed}
         cell = made.add(
             label, variant=variant.id, factors=factors, quality=QUALITY, history=HISTORY

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -227,3 +228,22 @@ def test_both_3d_views_turn_together(opened: Any) -> None:
     opened.find_elements("css selector", ".pair canvas")[1].send_keys(Keys.ARROW_LEFT)
     after = canvas_pixels(opened)
     assert np.abs(after - before).mean() > 0.005
+
+
+def test_the_page_of_one_cell_works_and_has_no_tags_where_photographs_are_alike(
+    browser: Any, alone: Path
+) -> None:
+    browser.get_log("browser")
+    browser.get(alone.as_uri())
+    canvas_pixels(browser)
+    assert browser.get_log("browser") == []
+    assert browser.execute_script("return document.querySelectorAll('canvas').length") == 1
+    shown = browser.execute_script("return document.querySelector('main').innerText")
+    tagged = {"HR", "LR"} & set(re.findall(r"\w+", shown))
+    assert bool(tagged) == (alone.parent.name == "mixed")
+    assert sides(browser, "views") == ["photograph", "render"]
+    places = [
+        browser.execute_script(f"return document.querySelector('{of}').getBoundingClientRect().top")
+        for of in ("#splats canvas", "#views .stage", "#photographs")
+    ]
+    assert places == sorted(places)

@@ -5,7 +5,9 @@ from __future__ import annotations
 import base64
 import hashlib
 import html
+import json
 import re
+import shutil
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -46,6 +48,60 @@ def test_the_same_store_gives_the_same_bytes(copied: Path, page: Path) -> None:
     again = page_of(copied)
     assert again.read_bytes() == page.read_bytes()
     assert page.stat().st_size < document.MAX_BYTES
+
+
+def test_the_page_of_one_cell_shows_the_scene_and_no_furniture_of_a_comparison(alone: Path) -> None:
+    parsed = Parsed(alone.read_text())
+    order = [attributes["id"] for tag, attributes in parsed.tags if tag == "section"]
+    assert order == [
+        "answer",
+        "splats",
+        "views",
+        "photographs",
+        "training",
+        "curves",
+        "made",
+        "tables",
+    ]
+    assert parsed.texts["h1"][0] == "fern"
+    data = data_of(alone)
+    assert data["alone"]
+    assert data["mixed"] == (alone.parent.name == "mixed")
+    assert [view["view"] for view in data["views"]] == ["IMG_009", "IMG_001"], "worst first"
+    words = " ".join(text for tag, of in parsed.texts.items() if tag != "script" for text in of)
+    for furniture in (
+        "No ablation",
+        "Change from",
+        "Every change",
+        "paper",
+        "Compared with",
+        "arms",
+    ):
+        assert furniture not in words
+    assert "not known, how the photographs were placed" in words
+    terms, texts = ([text for text in parsed.texts[of] if text.strip()] for of in ("dt", "dd"))
+    values = dict(zip(terms, texts, strict=True))
+    assert values == {
+        "PSNR": "20.00 dB",
+        "SSIM": "0.8000",
+        "LPIPS": "0.2500",
+        "Gaussians": "5,000",
+        "Training time": "100 s",
+    }
+    if not data["mixed"]:
+        assert not {"HR", "LR"} & set(re.findall(r"\w+", words))
+
+
+def test_the_page_of_one_cell_says_how_the_scene_was_placed(alone: Path, tmp_path: Path) -> None:
+    store = Path(shutil.copytree(alone.parent.parent / "store", tmp_path / "store"))
+    (report,) = store.glob("variants/0123*/report.json")
+    found = {"images": 6, "registered": 5, "points": 1234, "reprojection_error_px": 0.567}
+    report.write_text(json.dumps(json.loads(report.read_text()) | found))
+    page = html.unescape((build(store, pictures=[]).folder / "report.html").read_text())
+    text = "5 of 6 photographs are placed by structure from motion, 1,234 points, mean reprojection"
+    assert f"<li>{text} error 0.57 px</li>" in page
+    assert 'id="splats"' not in page
+    assert "were left out: --pictures none" in page
 
 
 def test_everything_of_the_store_is_there(page: Path) -> None:

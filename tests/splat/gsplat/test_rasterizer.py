@@ -1,7 +1,7 @@
 """gsplat's renderer: what it is asked for, and what becomes of its answer.
 
-gsplat's kernels need a GPU. `xrgs.rasterization` stands in for them, and the truth is our renderer
-without gsplat's signature in between.
+gsplat's kernels need a GPU. `gsplat_api.rasterization` stands in for them, and the truth is our
+renderer without gsplat's signature in between.
 """
 
 from __future__ import annotations

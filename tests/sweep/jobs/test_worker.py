@@ -98,8 +98,7 @@ def in_this_process(
     """(work) -> the answer that the child's `main` writes when it does this work."""
     monkeypatch.setattr(supervise, "follow_parent", lambda: None)
     monkeypatch.setattr(processes, "offer_to_oom_killer", lambda: None)
-    for name in ("guard_streams", "set_passive_openmp_wait"):
-        monkeypatch.setattr(worker, name, lambda: None)
+    monkeypatch.setattr(worker, "guard_streams", lambda: None)
     monkeypatch.setattr(faulthandler, "enable", lambda: None)
 
     def answered(work: Callable[..., dict[str, Any]]) -> dict[str, Any]:

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 from xrgs.errors import StoreError
-from xrgs.evaluation.metrics import VIEW_METRICS
+from xrgs.evaluation.metrics import METRICS, VIEW_METRICS
 from xrgs.report.collect import CURVE_COLUMNS, number_columns
-from xrgs.report.compare import is_ratio
 from xrgs.report.markup import titled
-from xrgs.report.writing import arrow, by_key, signed, verdict
+from xrgs.report.photographs import alike
+from xrgs.report.writing import by_key, number, verdict, with_unit
 from xrgs.safeio.sanitize import MAX_CELL, counted, for_line
 
 if TYPE_CHECKING:
@@ -54,6 +54,10 @@ class Content:
     """The cameras of the models."""
     notes: list[str] = field(default_factory=list)
     """What was left out, and why."""
+    alone: bool = False
+    """Whether there is nothing to compare: every cell is of one label."""
+    mixed: bool = True
+    """Whether photographs differ in resolution, so that HR and LR tell something."""
 
 
 def shown(text: object) -> str:
@@ -163,6 +167,24 @@ def add_trade_offs(content: Content, comparison: Comparison) -> None:
         content.trade_offs.append(texts | numbers)
 
 
+#: What the page of one label says first of each scene.
+_SUMMARY = ("psnr", "ssim", "lpips", "gaussians", "training_time_s")
+
+
+def summary(comparison: Comparison) -> list[tuple[str, list[tuple[str, str]]]]:
+    """Return the scores and counts that come first, by scene: means over its finished cells."""
+    done = comparison.cells[comparison.cells["state"] == "done"]
+    named = {metric.name: metric for metric in METRICS}
+    metrics = [named[name] for name in _SUMMARY]
+    return [
+        (
+            shown(scene),
+            [(m.label, number(v, m.unit)) for m in metrics if (v := rows[m.name].mean()) == v],
+        )
+        for scene, rows in done.groupby("scene")
+    ]
+
+
 #: Entries of the provenance that the context has.
 _MADE_WITH = {
     "arithmetic": "Arithmetic",
@@ -218,8 +240,7 @@ def answers(comparison: Comparison) -> list[Answer]:
 def _change(metric: Metric, row: Change) -> str:
     if math.isnan(row.change):
         return metric.label
-    unit = "%" if is_ratio(metric) else metric.unit
-    return f"{metric.label} {signed(row.change)} {unit} {arrow(row.change, metric)}"
+    return f"{metric.label} {with_unit(row.change, metric)}"
 
 
 def page_context(
@@ -240,7 +261,7 @@ def page_context(
     done = cells[cells["cell_id"].isin(sweep.done)].drop_duplicates("cell_id")
     replicates = done.drop_duplicates(["variant_seed", "seed"])
     rows = [
-        ("Compared with", shown(comparison.base)),
+        ("Compared with", shown(comparison.base) if comparison.groups else ""),
         ("Scenes", ", ".join(map(shown, comparison.scenes))),
         ("Replicates (variant.seed/seed)", _listed(_replicates(replicates))),
         ("Cells", f"{len(done)} of {cells['cell_id'].nunique()} are done"),
@@ -248,7 +269,7 @@ def page_context(
     for condition, of in contexts.items():
         rows.append((shown(titled("Training and scores", condition)), of.of_scores))
         rows.append((shown(titled("Times", condition)), of.of_times))
-    rows += [(shown(scene), text) for scene, text in _views(done, variants)]
+    rows += [(shown(scene), text) for scene, text in _views(sweep, done, variants)]
     made = sweep.provenance
     rows += [(name, _listed(made.get(key, ["n/a"]))) for key, name in _MADE_WITH.items()]
     return [(name, text) for name, text in rows if text]
@@ -263,18 +284,20 @@ def _listed(values: Iterable[Any]) -> str:
     return shown(", ".join(dict.fromkeys(str(value) for value in values)))
 
 
-def _views(done: pd.DataFrame, variants: Mapping[str, Variant]) -> list[tuple[str, str]]:
+def _views(
+    sweep: Sweep, done: pd.DataFrame, variants: Mapping[str, Variant]
+) -> list[tuple[str, str]]:
     """Return the numbers and sizes of the views of each scene's first variant."""
     rows = []
     for scene, variant_id in done.drop_duplicates("scene")[["scene", "variant_id"]].to_numpy():
         variant = variants.get(variant_id)
         if variant is None:
             continue
-        by_kind = {
-            "HR": [v for v in variant.views if v.split == "train" and v.tag == "HR"],
-            "LR": [v for v in variant.views if v.split == "train" and v.tag == "LR"],
-            "test": [v for v in variant.views if v.split == "test"],
-        }
+        train = [v for v in variant.views if v.split == "train"]
+        by_kind = {"training": train}
+        if not alike(sweep.variants[variant_id]):
+            by_kind = {tag: [v for v in train if v.tag == tag] for tag in ("HR", "LR")}
+        by_kind["test"] = [v for v in variant.views if v.split == "test"]
         sizes = {
             kind: _listed(f"{view.width} × {view.height}" for view in views)
             for kind, views in by_kind.items()

@@ -26,14 +26,15 @@ from xrgs.report.html.content import (
     finite,
     page_context,
     shown,
+    summary,
     why,
 )
 from xrgs.report.html.images import ERROR_RANGE, add_trained, add_views
 from xrgs.report.markup import filled, filled_places, titled, to_latex, to_markdown
 from xrgs.report.paper import counterparts
-from xrgs.report.photographs import photographs
-from xrgs.report.writing import NO_INTERVAL, named, number, signed
-from xrgs.runtime.text import TextTable
+from xrgs.report.photographs import alike, photographs, placement
+from xrgs.report.writing import NO_INTERVAL, number, signed, with_unit
+from xrgs.runtime.text import TextTable, listed
 from xrgs.safeio.atomic import write_text
 from xrgs.safeio.sanitize import for_csv, for_line
 
@@ -89,19 +90,32 @@ def write_document(
         add_trained(content, store, comparison, variants, _TRAINING_BYTES, _MODEL_BYTES)
     else:
         content.notes.append("Photographs, renders and models were left out: --pictures none.")
+    alone = not comparison.groups
+    named = listed(comparison.scenes)
     head = {
         "id": shown(sweep.id),
+        "alone": alone,
+        "title": shown(named if alone else f"Change from {comparison.base}"),
+        "summary": summary(comparison),
         "commands": [shown(" ".join(("xrgs-sweep", *words))) for words in sweep.commands.values()],
         "base": shown(comparison.base),
         "answers": answers(comparison),
         "context": page_context(sweep, comparison, tables.contexts, variants),
-        "photographs": [
-            (shown(scene), [for_line(note) for note in notes])
-            for scene, notes in photographs(sweep)
-        ],
+        "photographs": _photographs(sweep, alone=alone),
         "warnings": [shown(text) for text in (*warnings, *tables.cautions)],
     }
+    content.alone = alone
+    content.mixed = not all(map(alike, sweep.variants.values()))
     write_text(file, _fitting(head, content, tables, [table for table in texts if table.rows]))
+
+
+def _photographs(sweep: Sweep, *, alone: bool) -> list[tuple[str, list[str]]]:
+    """Return what became of each scene's photographs; of one label, how they were placed first."""
+    found = dict(photographs(sweep))
+    if alone:
+        done = sweep.cells.loc[sweep.cells["state"] == "done", "scene"].unique()
+        found = {scene: (placement(sweep, scene), *found.get(scene, ())) for scene in done}
+    return [(shown(scene), [*map(for_line, notes)]) for scene, notes in found.items()]
 
 
 def _variants(store: JoinedStore, cells: pd.DataFrame, content: Content) -> dict[str, Variant]:
@@ -177,6 +191,7 @@ def _printable(table: TextTable) -> TextTable:
         tuple(tuple(map(shown, row)) for row in table.rows),
         table.align,
         tuple(map(for_line, notes)),
+        prose=table.prose,
     )
 
 
@@ -263,9 +278,10 @@ def _changes(long: pd.DataFrame, scenes: Sequence[str]) -> Iterator[dict[str, An
     for row in long.to_dict("records"):
         if row["level"] == "scene" and only:
             continue
-        metric, printed = metrics[row["metric"]], str(row["printed"]).strip()
+        metric = metrics[row["metric"]]
+        change = with_unit(row["change"], metric).strip()
         label, scene = shown(row["label"]), shown(row["scene"] or only)
-        direction = {"↑": "better", "↓": "worse"}.get(printed[-1:], "")
+        direction = {"↑": "better", "↓": "worse"}.get(change[-1:], "")
         verdict = "" if row["verdict"] == NO_INTERVAL else shown(row["verdict"])
         numbers = [
             (text, finite(row[name]), "")
@@ -284,8 +300,8 @@ def _changes(long: pd.DataFrame, scenes: Sequence[str]) -> Iterator[dict[str, An
             "cells": [
                 (titled(label, shown(row["condition"])), None, ""),
                 ("" if only else scene or "mean", None, ""),
-                (named(metric), None, ""),
-                (printed, finite(row["change"]), direction),
+                (metric.label, None, ""),
+                (change, finite(row["change"]), direction),
                 (verdict, None, ""),
                 *numbers,
                 (f"{row['agree']} of {row['n_values']}" if row["n_values"] > 1 else "", None, ""),

@@ -21,7 +21,6 @@ from xrgs.capture.images import ImageError
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.evaluation.metrics import VIEW_METRICS
 from xrgs.report.html.content import finite, run_names, runs, shown, why
-from xrgs.runtime.machine import set_passive_openmp_wait
 from xrgs.runtime.progress import progress
 
 if TYPE_CHECKING:
@@ -298,7 +297,6 @@ def add_trained(
     count = sum(map(len, readable))
     if not count:
         return
-    set_passive_openmp_wait()  # before torch is imported
     from xrgs.viewer.trained import GAUSSIAN_BYTES, SHOWN_OF_A_TAG, TrainedScene
 
     fitting = int(max_model_bytes * 3 / 4 / GAUSSIAN_BYTES)  # Gaussians of all models

@@ -26,7 +26,18 @@ function distinct(values) {
 
 function fill(select, options, chosen) {
   select.replaceChildren(...options.map(([value, text]) => element("option", { value }, text)));
+  if (data.alone && select.parentElement?.tagName === "LABEL") select.parentElement.hidden = options.length < 2;
   if (chosen !== undefined) select.value = chosen;
+}
+
+// The name of a trained arm: on the page of one label there is no other.
+function armName(label) {
+  return data.alone ? "render" : label;
+}
+
+// HR, LR or test; where photographs are alike, training or test.
+function kindName(kind) {
+  return data.mixed || kind === "test" ? kind : "training";
 }
 
 function labelled(text, select) {
@@ -93,12 +104,12 @@ function startFigures(sections) {
 }
 
 document.addEventListener("DOMContentLoaded", () => {
-  startFilters();
+  if (!data.alone) startFilters();
   startTables();
   const sections = { views: startViews(), training: startTraining() };
   startScores(sections.views);
-  startCurves();
-  startTradeOffs();
+  if (document.getElementById("curves")) startCurves();
+  if (!data.alone) startTradeOffs();
   startSplats();
   startFigures(sections);
 });

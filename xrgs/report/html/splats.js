@@ -191,7 +191,7 @@ class Panel {
     for (const camera of cameras) {
       for (const point of frustum(camera)) {
         points.push(...point);
-        tints.push(...TINTS[camera.kind]);
+        tints.push(...TINTS[data.mixed || camera.kind === "test" ? camera.kind : "HR"]);
       }
     }
     this.lineCount = points.length / 3;
@@ -269,17 +269,19 @@ class Splats {
     this.keys = distinct(data.models.map(runName));
     this.scene = element("select");
     this.look = element("select");
-    this.sides = [element("select"), element("select")];
+    // Two models side by side, or the only one.
+    const places = data.alone ? [0] : [0, 1];
+    this.sides = places.map(() => element("select"));
     this.frusta = element("input", { type: "checkbox", checked: "" });
     const nearer = element("button", { type: "button" }, "Nearer");
     const farther = element("button", { type: "button" }, "Farther");
-    const controls = element("div", { class: "controls" }, labelled("Scene", this.scene), labelled("Left", this.sides[0]), labelled("Right", this.sides[1]), labelled("From", this.look), labelled("Cameras", this.frusta), nearer, farther);
-    const swatches = [["hr", "HR"], ["lr", "LR"], ["test", "test"]].map(([kind, text]) => element("span", {}, element("i", { class: `swatch ${kind}` }), `${text} camera`));
-    this.captions = [element("figcaption"), element("figcaption")];
-    const canvases = [0, 1].map(() => element("canvas", { tabindex: "0", role: "img" }));
+    const controls = element("div", { class: "controls" }, labelled("Scene", this.scene), ...this.sides.map((select, place) => labelled(["Left", "Right"][place], select)), labelled("From", this.look), labelled("Cameras", this.frusta), nearer, farther);
+    const swatches = (data.mixed ? ["HR", "LR", "test"] : ["HR", "test"]).map((kind) => [kind.toLowerCase(), kindName(kind)]).map(([kind, text]) => element("span", {}, element("i", { class: `swatch ${kind}` }), `${text} camera`));
+    this.captions = places.map(() => element("figcaption"));
+    const canvases = places.map(() => element("canvas", { tabindex: "0", role: "img" }));
     const figures = canvases.map((canvas, place) => element("figure", {}, canvas, this.captions[place]));
-    const note = element("p", { class: "note" }, "Drag or press the arrow keys to turn both, with Shift to shift them; + and - or the wheel over a focused picture go nearer and farther. These are not the renders that are scored: only the Gaussians that show most in training views are kept, quantised to 8 and 16 bits, with their mean colour for all directions.");
-    body.append(controls, element("div", { class: "legend" }, ...swatches), element("div", { class: "pair" }, ...figures), note);
+    const note = element("p", { class: "note" }, `Drag or press the arrow keys to turn ${data.alone ? "it, with Shift to shift it" : "both, with Shift to shift them"}; + and - or the wheel over a focused picture go nearer and farther. These are not the renders that are scored: only the Gaussians that show most in training views are kept, quantised to 8 and 16 bits, with their mean colour for all directions.`);
+    body.append(controls, element("div", { class: "legend" }, ...swatches), element("div", { class: data.alone ? "pair single" : "pair" }, ...figures), note);
     this.panels = canvases.map((canvas) => new Panel(canvas));
     fill(this.scene, this.keys.map((key) => [key, key]));
     this.scene.addEventListener("change", () => this.choose());
@@ -311,7 +313,7 @@ class Splats {
     this.cameras = data.cameras.find((run) => runName(run) === this.scene.value).cameras;
     const options = this.models.map((model, place) => [place, model.label]);
     this.sides.forEach((select, place) => fill(select, options, Math.min(place, options.length - 1)));
-    fill(this.look, this.cameras.map((camera, place) => [place, `${camera.kind} ${camera.name}`]));
+    fill(this.look, this.cameras.map((camera, place) => [place, `${kindName(camera.kind)} ${camera.name}`]));
     const test = this.cameras.findIndex((camera) => camera.kind === "test");
     this.look.value = Math.max(0, test);
     this.load();
@@ -322,7 +324,7 @@ class Splats {
       const model = this.models[Number(this.sides[side].value)];
       panel.load(model, this.cameras);
       const kept = `${model.count.toLocaleString("en")} of ${model.total.toLocaleString("en")} Gaussians, ${(100 * model.share).toFixed(1)} % of the blending weight`;
-      this.captions[side].replaceChildren(element("b", {}, model.label), ` ${kept}`);
+      this.captions[side].replaceChildren(...(data.alone ? [] : [element("b", {}, model.label), " "]), kept);
       panel.canvas.setAttribute("aria-label", `3D view of ${model.label}: ${this.scene.value}. ${kept}. Arrow keys turn it.`);
     });
     if (this.camera) this.draw();
@@ -390,6 +392,7 @@ class Splats {
 // Started when it comes into sight, since a graphics processor may be busy for a moment.
 function startSplats() {
   const body = document.getElementById("splats-body");
+  if (!body) return;
   if (!data.models.length) {
     body.append(element("p", { class: "warning" }, "This page has no Gaussians; the end of the page says why."));
     return;

@@ -167,21 +167,22 @@ function testPictures(entry) {
   const hidden = entry.hidden ? `; a mask hides ${(100 * entry.hidden).toFixed(1)} % of it` : "";
   return [
     { name: "photograph", caption: `${entry.size[0]} × ${entry.size[1]} px${hidden}`, image: entry.photograph, alt: `Photograph: ${at}` },
-    ...arms.map((arm) => ({ name: arm.label, label: arm.label, caption: scoresText(arm.scores), image: arm.image, alt: `Render by ${arm.label}: ${at}. ${scoresText(arm.scores)}` })),
-    ...arms.map((arm) => ({ name: `error of ${arm.label}`, caption: "", image: arm.error, apart: true, alt: `Error map of ${arm.label}: ${at}` })),
+    ...arms.map((arm) => ({ name: armName(arm.label), label: arm.label, caption: scoresText(arm.scores), image: arm.image, alt: `Render by ${arm.label}: ${at}. ${scoresText(arm.scores)}` })),
+    ...arms.map((arm) => ({ name: data.alone ? "error" : `error of ${arm.label}`, caption: "", image: arm.error, apart: true, alt: `Error map of ${arm.label}: ${at}` })),
   ];
 }
 
 function trainingPictures(entry) {
   const at = `training view ${entry.view}, ${entry.scene}`;
   const size = `${entry.size[0]} × ${entry.size[1]} px`;
-  const found = [{ name: `${entry.tag} photograph`, caption: `as trained on, ${size}`, image: entry.photograph, coarse: entry.tag === "LR", alt: `${entry.tag} photograph, ${size}: ${at}` }];
+  const found = [{ name: data.mixed ? `${entry.tag} photograph` : "photograph", caption: `as trained on, ${size}`, image: entry.photograph, coarse: data.mixed && entry.tag === "LR", alt: `${kindName(entry.tag)} photograph, ${size}: ${at}` }];
   if (entry.original !== null) found.push({ name: "original", caption: "before it was degraded; only all_hr trains on it", image: entry.original, alt: `The photograph before it was degraded: ${at}` });
-  return [...found, ...entry.arms.map((arm) => ({ name: arm.label, label: arm.label, caption: "render", image: arm.image, alt: `Render by ${arm.label}: ${at}` }))];
+  return [...found, ...entry.arms.map((arm) => ({ name: armName(arm.label), label: arm.label, caption: data.alone ? "" : "render", image: arm.image, alt: `Render by ${arm.label}: ${at}` }))];
 }
 
 function startViewer(id, entries, pictures, name, missing) {
   const body = document.getElementById(id);
+  if (!body) return { show() {} };
   if (entries.length) return new Viewer(body, entries, pictures, name);
   body.append(element("p", { class: "warning" }, missing));
   return { show() {} };
@@ -195,14 +196,15 @@ function startViews() {
 }
 
 function startTraining() {
-  const name = (entry) => `${entry.tag} ${entry.view}`;
+  const name = (entry) => (data.mixed ? `${entry.tag} ${entry.view}` : entry.view);
   return startViewer("training-body", data.training, trainingPictures, name, "This page has no training views; the end of the page says why.");
 }
 
 function startScores(viewer) {
   const table = document.getElementById("scores-table");
-  const heads = ["Scene", "View", "Arm", ...data.scores.map((score) => score.label)];
-  const head = element("tr", {}, ...heads.map((text, place) => element("th", place > 2 ? { class: "number" } : {}, text)));
+  if (!table) return;
+  const names = data.alone ? ["Scene", "View"] : ["Scene", "View", "Arm"];
+  const head = element("tr", {}, ...names.map((text) => element("th", {}, text)), ...data.scores.map((score) => element("th", { class: "number" }, score.label)));
   table.tHead.append(head);
   const rows = data.views.flatMap((entry, place) => entry.arms.map((arm) => ({ entry, place, arm })));
   for (const { entry, place, arm } of rows) {
@@ -218,13 +220,13 @@ function startScores(viewer) {
       const text = value === null ? "n/a" : value.toFixed(score.name.startsWith("psnr") ? 2 : 4);
       return element("td", { class: "number", "data-value": value ?? "" }, text);
     });
-    const row = element("tr", {}, element("td", {}, runName(entry)), element("td", {}, name), element("td", {}, arm.label), ...numbers);
+    const row = element("tr", {}, element("td", {}, runName(entry)), element("td", {}, name), ...(data.alone ? [] : [element("td", {}, arm.label)]), ...numbers);
     Object.assign(row.dataset, { scene: entry.scene, label: arm.label });
     table.tBodies[0].append(row);
   }
   makeSortable(table);
   const first = data.scores[0];
-  sortBy(table, 3, !first.higher);
+  sortBy(table, names.length, !first.higher);
   onFilter.push(() => {
     for (const row of table.tBodies[0].rows) row.hidden = !passes(row.dataset);
   });

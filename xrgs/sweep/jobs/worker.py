@@ -24,7 +24,7 @@ import msgspec
 from xrgs.errors import UnreadableError, XrgsError
 from xrgs.experiment.cell_folder import LOG
 from xrgs.runtime import processes
-from xrgs.runtime.machine import set_passive_openmp_wait, set_portable_blas
+from xrgs.runtime.machine import set_portable_blas
 from xrgs.runtime.signals import StopRequest, StopSignal, end_by_sigterm
 from xrgs.runtime.streams import guard_streams, log_to_stderr, say
 from xrgs.safeio.atomic import write_json
@@ -176,7 +176,6 @@ def _build_variant(request: Mapping[str, Any]) -> dict[str, Any]:
     from xrgs.experiment.store import Store
 
     log_to_stderr()
-    _import_colmap()
     conf, store = from_dict(request["conf"]), Store(Path(request["store"]))
     built = variant.build(conf.scene, conf.variant, store.variants, store.scenes)
     return {"variant": built.id}
@@ -191,15 +190,6 @@ def _restore_variant(request: Mapping[str, Any]) -> dict[str, Any]:
     conf, store = from_dict(request["conf"]), Store(Path(request["store"]))
     restore_variant(store.variants, request["variant"], conf.scene, conf.variant, store.scenes)
     return {}
-
-
-def _import_colmap() -> None:
-    """Import COLMAP without its handler of SIGTERM, which prints a stack on the terminal."""
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
-    from xrgs.capture import sfm  # noqa: F401
-
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
 
 
 def _run_cell(request: Mapping[str, Any]) -> dict[str, Any]:
@@ -267,7 +257,6 @@ def main(job: str, request: str, answer: str) -> None:
     faulthandler.enable()
     supervise.follow_parent()
     processes.offer_to_oom_killer()
-    set_passive_openmp_wait()
     given: dict[str, Any] = {}
     try:
         given = read_struct(Path(request), dict[str, Any])
