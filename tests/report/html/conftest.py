@@ -119,7 +119,10 @@ def _pictured(folder: Path, tags: Mapping[str, str], count: int) -> Path:
         cell = made.add(
             label, variant=variant.id, factors=factors, quality=QUALITY, history=HISTORY
         )
-        write_json(cell.path / "config.json", baseline_config())
+        config = baseline_config()
+        if "LR" not in tags.values():
+            config = config | {"variant": config["variant"] | {"hr_fraction": 1.0}}
+        write_json(cell.path / "config.json", config)
         save_ply(cell.path / "splats.ply", make_gaussians(seed))
         for number, view in enumerate(TEST_VIEWS):
             photograph = images.read_png(variant.folder / f"images/test/{view}.png")
