@@ -156,7 +156,8 @@ def test_the_model_knows_nothing_of_experiments() -> None:
         if package_of(name) == "splat"
         for other in own_imports(name)
     }
-    assert used <= {"errors", "safeio", "splat"}
+    # The top of the package is imported anyway, and imports nothing itself.
+    assert used <= {"__init__", "errors", "safeio", "splat"}
 
 
 def test_reports_have_no_torch_code() -> None:

@@ -35,7 +35,7 @@ def test_import_is_light() -> None:
 def python(script: str, **environment: str) -> subprocess.CompletedProcess[str]:
     """Run a script in a new interpreter, with no policy of OpenMP but in `environment`."""
     kept = {name: text for name, text in os.environ.items() if name != "OMP_WAIT_POLICY"}
-    command = [sys.executable, "-P", "-W", "always", "-c", script]
+    command = [sys.executable, "-P", "-c", script]
     return subprocess.run(
         command, capture_output=True, text=True, check=True, env=kept | environment
     )
