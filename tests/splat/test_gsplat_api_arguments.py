@@ -176,6 +176,21 @@ def test_float64_is_rendered_in_float64() -> None:
     torch.testing.assert_close(image.float(), rasterization(**usual)[0], atol=1e-5, rtol=0)
 
 
+@pytest.mark.parametrize("size", [1e6, 1e8, 1e10, 1e15])
+@pytest.mark.parametrize("backend", ["native", "torch"])
+def test_a_gaussian_far_larger_than_the_image_covers_it(backend: str, size: float) -> None:
+    """Its alpha is its opacity everywhere; int32 holds radii of 2e9 px, and float32 overflows."""
+    views = {"viewmats": torch.eye(4)[None], "Ks": torch.diag(torch.tensor([60.0, 60, 1]))[None]}
+    _, alpha, meta = rasterization(
+        torch.tensor([[0.0, 0, 4]]), torch.tensor([[1.0, 0, 0, 0]]),
+        torch.tensor([[size, size, 1]]), torch.tensor([0.5]), torch.ones(1, 3),
+        **views, width=32, height=24, backend=backend,
+    )  # fmt: skip
+    torch.testing.assert_close(alpha, torch.full((1, 24, 32, 1), 0.5))
+    assert (meta["radii"] > 1e6).all()
+    assert meta["conics"].dtype == torch.float32
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -202,6 +217,16 @@ def test_float64_is_rendered_in_float64() -> None:
             {"means": torch.full((80, 3), torch.nan)},
             "means has values that are not finite",
         ),
+        ({"backgrounds": torch.full((2, 3), torch.inf)}, "backgrounds has values that are not"),
+        ({"far_plane": 1.0, "near_plane": 2.0}, "far_plane must be above near_plane"),
+        ({"far_plane": torch.nan}, "far_plane must be above near_plane"),
+        ({"eps2d": -0.1}, "eps2d at least 0"),
+        ({"Ks": torch.diag(torch.tensor([40.0, 40, 2])).repeat(2, 1, 1)}, "the last row of K"),
+        (
+            {"viewmats": torch.diag(torch.tensor([1.0, 1, 1, 2])).repeat(2, 1, 1)},
+            "camera 0: the last row of viewmat must be",
+        ),
+        ({"scales": torch.full((80, 3), 1e19)}, "scales: a Gaussian is larger than"),
         ({"means": torch.zeros(80, 3, device="meta")}, "means is on meta: xrgs renders on the CPU"),
     ],
 )

@@ -30,6 +30,8 @@ RasterizeMode = Literal["classic", "antialiased"]
 #: Constants of gsplat 1.5.3's kernels (`RasterizeToPixels3DGSFwd.cu`, `ProjectionEWA3DGSFused.cu`).
 ALPHA_MIN, ALPHA_MAX, TRANSMITTANCE_MIN = 1.0 / 255.0, 0.999, 1e-4
 MAX_RADIUS_SIGMAS = 3.33
+MAX_RADIUS = 2.0**31 - 128
+"""Largest radius in `meta`, px: of an int32, and a float32 too."""
 MIN_DEPTH_ALPHA = 1e-10
 """Smallest alpha by which the expected depth is divided."""
 
@@ -195,7 +197,12 @@ def rasterization(
     backend = backend_for(means, backend)
     cameras = _cameras(viewmats, Ks, width, height)
     _check_shapes(shapes, colors, len(cameras), sh_degree, backgrounds)
-    _check_values(shapes, colors)
+    _check_values(shapes, colors, backgrounds)
+    if not (near_plane < far_plane and eps2d >= 0):
+        raise ValueError(
+            "far_plane must be above near_plane, and eps2d at least 0, got "
+            f"far_plane={far_plane}, near_plane={near_plane}, eps2d={eps2d}"
+        )
     settings = RasterSettings(
         near=near_plane,
         eps2d=eps2d,
@@ -266,10 +273,11 @@ def _whole(name: str, value: int) -> int:
         raise TypeError(f"{name} must be a whole number, got {value!r}") from None
 
 
-def _check_values(shapes: _Shapes, colors: Tensor) -> None:
-    """Check the values of all Gaussians: the rasterizer sees those alone that are drawn."""
-    for name, value in (*shapes._asdict().items(), ("colors", colors)):
-        if not torch.isfinite(value).all():
+def _check_values(shapes: _Shapes, colors: Tensor, backgrounds: Tensor | None) -> None:
+    """Check the values of all Gaussians: the rasterizer sees only those that are drawn."""
+    named = {**shapes._asdict(), "colors": colors, "backgrounds": backgrounds}
+    for name, value in named.items():
+        if value is not None and not torch.isfinite(value).all():
             raise ValueError(f"{name} has values that are not finite")
     if (shapes.scales < 0).any():
         raise ValueError(
@@ -328,6 +336,9 @@ def _cameras(viewmats: Tensor, Ks: Tensor, width: int, height: int) -> list[Came
     for index, (viewmat, K) in enumerate(zip(viewmats.detach(), Ks.detach(), strict=True)):
         try:
             cameras.append(Camera(viewmat, K, width, height))
+            for name, matrix in (("viewmat", viewmat), ("K", K)):
+                if (matrix[-1] - torch.eye(len(matrix))[-1]).abs().max() > 1e-5:  # an inverse's
+                    raise ValueError(f"the last row of {name} must be 0, ..., 0, 1")
         except ValueError as error:
             raise ValueError(f"viewmats, Ks, camera {index}: {error}") from error
     return cameras
@@ -357,8 +368,14 @@ def _project(
         inside = ((flat.means2d + radii > 0) & (flat.means2d - radii < size)).all(-1)
         usable = (flat.det > 0) & torch.isfinite(flat.det) & (flat.opacities >= settings.alpha_min)
         drawn = inside & usable & (radii > radius_clip).any(-1) & (radii > 0).all(-1)
-        conics = torch.stack([yy, -xy, xx], dim=-1) / flat.det[:, None]
-        values = (radii.int(), flat.means2d, flat.depths, conics, flat.opacities)
+        conics = (torch.stack([yy, -xy, xx], dim=-1) / flat.det[:, None]).to(flat.cov)
+        values = (
+            radii.clamp_max(MAX_RADIUS).int(),
+            flat.means2d,
+            flat.depths,
+            conics,
+            flat.opacities,
+        )
         views.append([_scatter(value, chosen, drawn, len(z)) for value in values])
     return _Projections(*(torch.stack(column) for column in zip(*views, strict=True)))
 

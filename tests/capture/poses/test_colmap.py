@@ -12,7 +12,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from tests.capture.poses.written import NAMES, PARAMS, POINTS, SIZE, viewmat, write_colmap
+from tests.capture.poses.written import NAMES, PARAMS, POINTS, SIZE, project, viewmat, write_colmap
 from xrgs.capture.lens import MODELS
 from xrgs.capture.poses import colmap
 from xrgs.errors import XrgsError
@@ -60,8 +60,34 @@ def test_what_images_observe_is_read(tmp_path: Path, form: str) -> None:
     assert (given.colors == (10, 20, 30)).all()
     for i, name in enumerate(NAMES):
         assert given.observed[name].tolist() == list(range(i + 1, len(POINTS)))
-    assert given.report == {"reprojection_error_px": pytest.approx(0.25 * np.mean(range(1, 13)))}
+    # The features are at x = 1 and y = the point's number, and not near their points; the errors
+    # that the model stores are of neither. COLMAP averages for each point first.
+    seen_in = [np.arange(i + 1, len(POINTS)) for i in range(len(NAMES))]
+    off = np.full((len(NAMES), len(POINTS)), np.nan)
+    for i, points in enumerate(seen_in):
+        off[i, points] = np.hypot(*(project(i)[points] - np.c_[points * 0 + 1, points + 1]).T)
+    assert given.report == {
+        "reprojection_error_px": pytest.approx(np.nanmean(np.nanmean(off[:, 1:], axis=0)))
+    }
     assert given.notes == []
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_points_behind_their_cameras_are_counted(tmp_path: Path, form: str) -> None:
+    """All of an image whose optical axis was turned round; the mean is of the others."""
+    model = pycolmap.Reconstruction(with_features(tmp_path, form=form))
+    turn = pycolmap.Rigid3d(np.c_[np.diag([-1.0, 1.0, -1.0]), [0, 0, 0]])
+    model.images[3].frame.rig_from_world = turn * model.images[3].cam_from_world()
+    (tmp_path / "turned").mkdir()
+    (model.write_binary if form == "binary" else model.write_text)(tmp_path / "turned")
+    given = colmap.read(tmp_path / "turned")
+    assert ["9 of 30 observations" in note for note in given.notes] == [True]
+    off = np.full((2, len(POINTS)), np.nan)
+    for i in range(2):
+        points = np.arange(i + 1, len(POINTS))
+        off[i, points] = np.hypot(*(project(i)[points] - np.c_[points * 0 + 1, points + 1]).T)
+    mean = np.nanmean(np.nanmean(off[:, 1:], axis=0))
+    assert given.report == {"reprojection_error_px": pytest.approx(mean)}
 
 
 @pytest.mark.parametrize("form", FORMS)

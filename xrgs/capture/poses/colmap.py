@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from xrgs.capture.lens import MODELS, Lens, lens_of_model
-from xrgs.capture.poses.given import GivenPoses
+from xrgs.capture.poses.given import CameraOf, GivenPoses
 from xrgs.errors import XrgsError
 from xrgs.runtime.text import listed
 from xrgs.safeio.files import list_names
@@ -50,8 +50,8 @@ class _Image:
     """World to camera, w first."""
     translation: Sequence[float]
     camera: int
-    points: NDArray[np.uint64]
-    """The numbers of its features' points."""
+    features: NDArray[np.void]
+    """Its features that have a point, of `_FEATURE`; px."""
 
 
 @dataclass(frozen=True)
@@ -59,8 +59,6 @@ class _Points:
     numbers: NDArray[np.uint64]
     xyz: NDArray[np.float64]
     colors: NDArray[np.uint8]
-    errors: NDArray[np.float64]
-    """Reprojection errors, px; below 0 where they are not known."""
 
 
 def files(root: Path) -> list[Path]:
@@ -108,18 +106,62 @@ def read(root: Path) -> GivenPoses:
         except XrgsError as error:
             raise XrgsError(f"{images_file}: {name}: {error}") from error
 
-    known = points.errors[points.errors >= 0]
-    with np.errstate(over="ignore"):
-        report = {"reprojection_error_px": float(known.mean())} if len(known) else {}
+    xyz = points.xyz[order]
+    errors = [_errors(image, camera, numbers, xyz) for image in images.values()]
     return GivenPoses(
         list(images),
         camera,
-        points.xyz[order],
+        xyz,
         points.colors[order],
-        {name: _indices(image.points, numbers) for name, image in images.items()},
-        report,
-        _notes(root, models),
+        {
+            name: np.unique(_indices(image.features["point"], numbers)[0])
+            for name, image in images.items()
+        },
+        *_report(np.concatenate([np.zeros((0, 2)), *errors]), _notes(root, models)),
     )
+
+
+def _errors(
+    image: _Image,
+    camera: CameraOf,
+    numbers: NDArray[np.uint64],
+    xyz: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Project the points that an image observes; the errors that a model stores may be outdated.
+
+    Returns:
+        The place of each point and its distance from its feature in px [N, 2]: infinite behind the
+        camera and outside of its model. Nothing for an image whose camera can't be read.
+    """
+    try:
+        lens, viewmat = camera(image.name, (0, 0))
+    except XrgsError:
+        return np.zeros((0, 2))
+    places, known = _indices(image.features["point"], numbers)
+    features = image.features[known]
+    with np.errstate(all="ignore"):
+        x, y, z = viewmat[:3, :3] @ xyz[places].T + viewmat[:3, 3:]
+        off = lens.project(np.stack([x / z, y / z], -1)) - np.stack(
+            [features["x"], features["y"]], -1
+        )
+        errors = np.where(z > 0, np.hypot(*off.T), np.inf)
+    return np.stack([places, np.nan_to_num(errors, nan=np.inf, posinf=np.inf)], -1)
+
+
+def _report(errors: NDArray[np.float64], notes: list[str]) -> tuple[dict[str, float], list[str]]:
+    """Average errors [N, 2] for each point, and then over the points, as COLMAP does."""
+    seen = errors[np.isfinite(errors[:, 1])]
+    if behind := len(errors) - len(seen):
+        notes.append(
+            f"{behind} of {len(errors)} observations are of points that their cameras can't see, "
+            "which lie behind them or outside of the camera model: are the poses world to camera?"
+        )
+    if not len(seen):
+        return {}, notes
+    points, counts = np.unique(seen[:, 0], return_inverse=True, return_counts=True)[1:]
+    return {
+        "reprojection_error_px": float((np.bincount(points, seen[:, 1]) / counts).mean())
+    }, notes
 
 
 def _points(file: Path | None = None) -> _Points:
@@ -133,7 +175,7 @@ def _points(file: Path | None = None) -> _Points:
     xyz, colors = (
         (np.zeros((0, 3)), np.zeros((0, 3), np.uint8)) if file is None else read_points(file)
     )
-    return _Points(np.full(len(xyz), _NO_POINT), xyz, colors, np.full(len(xyz), -1.0))
+    return _Points(np.full(len(xyz), _NO_POINT), xyz, colors)
 
 
 def _notes(root: Path, models: Sequence[Sequence[Path]]) -> list[str]:
@@ -184,13 +226,17 @@ def _count_images(file: Path) -> int:
     return sum(1 for _ in _text_images(file))
 
 
-def _indices(points: NDArray[np.uint64], numbers: NDArray[np.uint64]) -> NDArray[np.intp]:
-    """Return the places of points in sorted numbers; a model that was thinned lacks some."""
-    own = np.unique(points)
-    places = np.searchsorted(numbers, own)
+def _indices(
+    points: NDArray[np.uint64], numbers: NDArray[np.uint64]
+) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """Return the places in sorted numbers of the points that are there, and which are there.
+
+    A model that was thinned lacks some.
+    """
+    places = np.searchsorted(numbers, points)
     there = places < len(numbers)
-    there[there] = numbers[places[there]] == own[there]
-    return places[there].astype(np.intp)
+    there[there] = numbers[places[there]] == points[there]
+    return places[there].astype(np.intp), there
 
 
 def _viewmat(image: _Image) -> NDArray[np.float64]:
@@ -242,13 +288,12 @@ class _Binary:
         self._at = end + 1
         return content.decode("utf-8", errors="replace")
 
-    def features(self) -> NDArray[np.uint64]:
-        """Take the features of an image, and return the numbers of their points."""
+    def features(self) -> NDArray[np.void]:
+        """Take the features of an image, and return those that have a point."""
         count = self.count(_FEATURE.itemsize)
         start = self._advance(count * _FEATURE.itemsize)
-        features = np.frombuffer(self._data, _FEATURE, count, start)
-        points: NDArray[np.uint64] = features["point"][features["point"] != _NO_POINT]
-        return points
+        features: NDArray[np.void] = np.frombuffer(self._data, _FEATURE, count, start)
+        return features[features["point"] != _NO_POINT]
 
     def skip(self, size: int) -> None:
         """Pass over bytes."""
@@ -298,11 +343,10 @@ def _binary_points(file: Path) -> _Points:
     data = _Binary(file)
     count = data.count(51)
     points = _Points(
-        np.empty(count, np.uint64), np.empty((count, 3)), np.empty((count, 3), np.uint8),
-        np.empty(count),
-    )  # fmt: skip
+        np.empty(count, np.uint64), np.empty((count, 3)), np.empty((count, 3), np.uint8)
+    )
     for i in range(count):
-        points.numbers[i], *xyz, r, g, b, points.errors[i] = data.values("Q3d3Bd")
+        points.numbers[i], *xyz, r, g, b, _ = data.values("Q3d3Bd")
         points.xyz[i], points.colors[i] = xyz, (r, g, b)
         data.skip(data.count(_TRACK_BYTES) * _TRACK_BYTES)
     data.end()
@@ -335,32 +379,31 @@ def _text_images(file: Path) -> Iterator[_Image]:
             if len(values) != 7:
                 raise ValueError("not a pose")
             image = _Image(
-                int(own), name, values[:4], values[4:], int(camera), np.zeros(0, np.uint64)
+                int(own), name, values[:4], values[4:], int(camera), np.zeros(0, _FEATURE)
             )
         below, features = next(lines, (number + 1, ""))
         with _line(file, below, f"X Y POINT3D_ID of each feature of {name}, or empty"):
             words = features.split()
             if len(words) % 3:
                 raise ValueError("not in threes")
-            points = [int(word) for word in words[2::3] if int(word) >= 0]
-            yield replace(image, points=np.array(points, np.uint64))
+            threes = zip(words[::3], words[1::3], words[2::3], strict=True)
+            own_features = [(float(x), float(y), int(p)) for x, y, p in threes if int(p) >= 0]
+            yield replace(image, features=np.array(own_features, _FEATURE))
 
 
 def _text_points(file: Path) -> _Points:
-    numbers, positions, colors, errors = [], [], [], []
+    numbers, positions, colors = [], [], []
     for number, line in _lines(file):
         if line:
             with _line(file, number, "POINT3D_ID X Y Z R G B ERROR TRACK"):
-                own, x, y, z, r, g, b, error = line.split(maxsplit=8)[:8]
+                own, x, y, z, r, g, b, _ = line.split(maxsplit=8)[:8]
                 numbers.append(np.uint64(int(own)))
                 positions.append((float(x), float(y), float(z)))
                 colors.append([np.uint8(int(value)) for value in (r, g, b)])
-                errors.append(float(error))
     return _Points(
         np.array(numbers, np.uint64),
         np.array(positions, np.float64).reshape(-1, 3),
         np.array(colors, np.uint8).reshape(-1, 3),
-        np.array(errors, np.float64),
     )
 
 
