@@ -180,11 +180,11 @@ def test_float64_is_rendered_in_float64() -> None:
 @pytest.mark.parametrize("backend", ["native", "torch"])
 def test_a_gaussian_far_larger_than_the_image_covers_it(backend: str, size: float) -> None:
     """Its alpha is its opacity everywhere; int32 holds radii of 2e9 px, and float32 overflows."""
-    views = {"viewmats": torch.eye(4)[None], "Ks": torch.diag(torch.tensor([60.0, 60, 1]))[None]}
+    viewmats, Ks = torch.eye(4)[None], torch.diag(torch.tensor([60.0, 60, 1]))[None]
     _, alpha, meta = rasterization(
         torch.tensor([[0.0, 0, 4]]), torch.tensor([[1.0, 0, 0, 0]]),
         torch.tensor([[size, size, 1]]), torch.tensor([0.5]), torch.ones(1, 3),
-        **views, width=32, height=24, backend=backend,
+        viewmats, Ks, 32, 24, backend=backend,
     )  # fmt: skip
     torch.testing.assert_close(alpha, torch.full((1, 24, 32, 1), 0.5))
     assert (meta["radii"] > 1e6).all()

@@ -293,7 +293,8 @@ class _Binary:
         count = self.count(_FEATURE.itemsize)
         start = self._advance(count * _FEATURE.itemsize)
         features: NDArray[np.void] = np.frombuffer(self._data, _FEATURE, count, start)
-        return features[features["point"] != _NO_POINT]
+        of_points: NDArray[np.void] = features[features["point"] != _NO_POINT]
+        return of_points
 
     def skip(self, size: int) -> None:
         """Pass over bytes."""
