@@ -174,7 +174,7 @@ def test_a_refactoring_of_the_code_of_variants_is_proven_and_keeps_variants_and_
     assert "1 variant built again, the same bit for bit" in printed
     declared = json.loads((copy.root / "xrgs/safeio/refactorings.json").read_text())
     assert "declared in refactorings.json: variant/core\n" in printed
-    assert len(declared["variant/core"]) == 2
+    assert len(declared["variant/core"]) == len(before["variant/core"]) + 1
     assert "2 cells, 2 done" in done_cells(copy)
     # A variant that the refactored code had built before it was declared is of equal code as well.
     (file,) = (copy.root / "s" / "variants").glob("*/variant.json")

@@ -110,7 +110,9 @@ def test_a_variant_is_built_described_and_drawn(xrgs_data: Run, tmp_path: Path) 
     code, out, err = xrgs_data("inspect", str(folder))
     assert code == 1
     assert out == ""
-    assert "variant.json: No such file or directory" in err
+    # Without its manifest it is a folder of photographs, and has none at the top.
+    assert f"scene.path={folder}" in err
+    assert "takes the images of all folders" in err
 
 
 def test_a_sheet_that_can_not_be_written_here_says_how_to_name_another(

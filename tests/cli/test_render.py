@@ -39,7 +39,7 @@ def test_a_frame_at_the_first_test_view_is_the_render_that_was_scored(
     both = ("--store", "s", "--views", "3", "--size", "64", "48", "--out", "both.mp4")
     code, out, err = forked_command("render", store.parent, *cells, *both)
     assert code == 0, err
-    assert out == "both.mp4: 3 frames of 128 x 48 px, 0.1 s\n"
+    assert out == "both.mp4: 3 frames of 128 x 48 px, 0.1 s, path orbit\n"
     gaussians = Store(store).cell(cell_id).gaussians()
     # Small and opaque ones, which the filter makes fainter.
     gaussians.scales = torch.full_like(gaussians.scales, -6)

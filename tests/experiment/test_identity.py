@@ -5,6 +5,7 @@ Code is edited in a copy of the package, whose digests then stand for the instal
 
 from __future__ import annotations
 
+import json
 import copy
 import dataclasses
 import importlib
@@ -328,8 +329,9 @@ def test_a_declared_refactoring_keeps_all_ids(package: Path, confs: dict[str, Co
     assert ids_after(refactor, confs)[0] == set()
     assert identity.changed_code(trained) == ["core"]
     exact = identity.current_code(trained)["core"]
-    text = f'{{"core": {{"{exact}": "{trained.code["core"]}"}}}}'
-    refactorings.FILE.write_text(text)
+    declared = refactorings.declared()
+    declared["core"][exact] = trained.code["core"]
+    refactorings.FILE.write_text(json.dumps(declared))
     assert identity.changed_code(trained) == []
     identity.training_code.cache_clear()
     assert identity.cell_id(identity.cell_identity(conf, "v")) == identity.cell_id(trained)

@@ -125,7 +125,11 @@ def gaussians(suffix: str) -> Parser:
 
 
 def transforms(_: Path) -> bytes:
-    frames = [{"file_path": f"{name}.png", "transform_matrix": np.eye(4).tolist()} for name in "ab"]
+    frames = []
+    for place, name in enumerate("ab"):
+        matrix = np.eye(4)
+        matrix[0, 3] = place
+        frames.append({"file_path": f"{name}.png", "transform_matrix": matrix.tolist()})
     lens = {"w": 40, "h": 30, "fl_x": 50.0, "fl_y": 50.0, "cx": 20.0, "cy": 15.0, "k1": 0.01}
     return json.dumps(lens | {"ply_file_path": "points.ply", "frames": frames}).encode()
 

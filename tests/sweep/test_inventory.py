@@ -50,7 +50,7 @@ def test_cells_are_chosen_by_name_state_age_and_size(store: Store) -> None:
 @pytest.mark.parametrize(
     ("of", "message"),
     [
-        ({"ids": ("ab",)}, "ab: several cells have such an id: abc1, abd2"),
+        ({"ids": ("ab",)}, "ab: several cells have such an id or scene: abc1, abd2"),
         ({"ids": ("x",)}, "x: no cells have such an id"),
         ({"scenes": ("frn",)}, "scenes=frn: no cell has that; choose from: fern, motorcycle"),
         ({"states": ("dun",)}, "states=dun: .*choose from: done, running"),

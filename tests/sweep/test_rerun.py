@@ -222,6 +222,7 @@ def test_a_missing_variant_is_built_and_has_to_be_the_same(
 ) -> None:
     variant_id = cell.identity().variant
     (tmp_path / "s" / "variants" / variant_id).rmdir()
+    spoil_config(cell, lambda c: c["scene"].update(kind="folder"))  # an embedded one has no path
     other = f"{variant_id[:16] if same_key else '0' * 16}-{'1' * 16}"
     requests: list[Any] = []
 

@@ -38,7 +38,7 @@ def render(model: Model, camera: Camera) -> NDArray[np.uint8]:
 def test_frames_at_test_views_are_their_renders(model: MakeModel, tmp_path: Path) -> None:
     shown = model(settings=RasterSettings(antialiased=True, background=(0.2, 0.1, 0.0)))
     line = make_film([shown], tmp_path / "frames", path="test", views=2, size=(48, 36))
-    assert line == f"{tmp_path / 'frames'}: 2 frames of 48 x 36 px"
+    assert line == f"{tmp_path / 'frames'}: 2 frames of 48 x 36 px, path test"
     for frame, view in zip(pictures(tmp_path / "frames"), shown.views[2:], strict=True):
         scale = 48 / 49
         K = view.camera.K * torch.tensor([[scale], [scale], [1.0]])
@@ -79,7 +79,7 @@ def test_frames_are_the_same_again_and_a_film_of_them_can_be_played(
     expected = pictures(tmp_path / "frames")
     np.testing.assert_array_equal(pictures(tmp_path / "again"), expected)
     line = make_film([model()], tmp_path / "a.mp4", views=5, size=(64, 48), fps=10)
-    assert line.endswith("5 frames of 64 x 48 px, 0.5 s")
+    assert line.endswith("5 frames of 64 x 48 px, 0.5 s, path orbit")
     with av.open(str(tmp_path / "a.mp4")) as film:
         assert film.streams.video[0].average_rate == 10
         decoded = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]

@@ -87,7 +87,7 @@ def rasterize(
         >>> gaussians.means.grad.shape
         torch.Size([50, 3])
     """
-    settings = settings or RasterSettings()
+    settings, backend = settings or RasterSettings(), backend_for(gaussians.means, backend)
     _check_harmonics(gaussians)
     if sh_degree is None:
         stored = math.isqrt(gaussians.shN.shape[1] + 1) - 1  # K = (degree + 1)^2
@@ -99,7 +99,7 @@ def rasterize(
         settings,
         sh_degree=sh_degree,
         raw=True,
-        backend=backend_for(gaussians.means, backend),
+        backend=backend,
     )
 
 

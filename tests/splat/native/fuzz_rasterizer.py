@@ -34,7 +34,7 @@ SIZES = (1, 2, 3, 15, 16, 17)
 FLOAT32_MAX = 3e38
 REFUSAL = re.compile(
     r"(the gradient of (means|quats|scales|opacities|sh0|shN|means2d_offset) is not finite"
-    r"|sh0 and shN overflow)"
+    r"|sh0 and shN overflow|scales: a Gaussian is larger than 1e18 px in the image)"
 )
 """The errors that a scene of finite numbers may give."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -204,4 +205,6 @@ def test_fuzzing(count: int) -> None:
     )
     assert result.returncode == 0, result.stdout + result.stderr
     refused = int(result.stdout.split(f"{count} scenes, ")[1].split(" ")[0])
-    assert 0 < refused < 0.03 * count  # that is, an error is no way out
+    # Sizes beyond 1e18 px are asked for by some cases; of the others an error is no way out.
+    too_large = re.findall(r"(\d+) from seed \d+: scales: a Gaussian is larger", result.stdout)
+    assert 0 < refused - sum(map(int, too_large)) < 0.03 * count

@@ -68,11 +68,12 @@ ON: dict[str, tuple[Any, type[Component]]] = {
     "continuous_weighting.gamma": (1.0, Weighting),
 }
 #: Keys that `off` declares too, with another value: they build no component by themselves. The
-#: first two change what another key switches on, as do those of `ATTENUATIONS`, which are refused
+#: first three change what another key switches on, as do those of `ATTENUATIONS`, which are refused
 #: without one; the last is read by `xrgs.training.count_matching`.
 OTHERS: dict[str, Any] = {
     "loss_weighting.stat_from": "unweighted",
     "mip.until": 20_000,
+    "natural_selection.drop_every": 100,
     "count_matched.gaussians": 100,
 }
 ATTENUATIONS: dict[str, Any] = {

@@ -136,7 +136,9 @@ def read_poses(path: str, photos: PhotoCollection) -> Reconstruction:
             given = transforms.read(source)
             names = listed([file.name for file in source])
             in_folder = [f"variant.poses: {names} is read"] if user_path(path).is_dir() else []
-        points = given.points[np.isfinite(given.points).all(axis=1)]
+        with np.errstate(over="ignore"):  # training is in 32 bits
+            usable = np.isfinite(given.points.astype(np.float32)).all(axis=1)
+        points = given.points[usable]
         if len(given.points) and len(points) < max(MIN_POINTS, len(given.points)):
             raise XrgsError(
                 f"{len(points)} of {len(given.points)} points are usable; at least {MIN_POINTS} "
