@@ -77,7 +77,6 @@ def test_a_report_takes_outcomes_and_names_those_that_are_not_there(
     code, out, err = forked_command(*arguments, *named)
     assert code == 0, err
     assert "one replicate: no interval" in out
-    assert "verdict" not in out
     code, _, err = forked_command(*arguments, "--outcomes", "nice")
     assert code == 1
     assert "--outcomes nice: there is no such metric; choose from: " in err

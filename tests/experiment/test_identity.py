@@ -5,10 +5,10 @@ Code is edited in a copy of the package, whose digests then stand for the instal
 
 from __future__ import annotations
 
-import json
 import copy
 import dataclasses
 import importlib
+import json
 import shutil
 import subprocess
 import sys
