@@ -124,7 +124,10 @@ def test_a_scene_that_fails_leaves_the_other_scenes(
     forked_command: RunCommand, store: Path, photographs: Callable[..., Path]
 ) -> None:
     flat = photographs(store.parent / "flat", 6)
-    scenes = ("scene=motorcycle,folder", f"scene.path={flat}")
+    (store.parent / "mine/scene").mkdir(parents=True)
+    text = f"name: flat\nkind: folder\npath: {flat}\n"  # the embedded scene has no path
+    (store.parent / "mine/scene/flat.yaml").write_text(text)
+    scenes = ("scene=motorcycle,flat", "--config-dir", "mine")
     arguments = ("+ablation=consistency", *SMOKE[1:], *scenes, "store=s")
     code, out, err = forked_command("sweep", store.parent, *arguments)
     assert code == 1

@@ -200,8 +200,8 @@ def test_an_unusable_checkpoint_is_logged_and_training_starts_over(
 def test_a_worker_that_is_killed_goes_on_in_another(
     compose: Callable[..., Conf], smoke_variants: Path, tmp_path: Path
 ) -> None:
-    changes = ("scene=motorcycle", "preset=smoke", "train.steps=600", "threads=1")
-    conf = compose(*changes, "checkpoint_s=0.2")
+    changes = ("scene=motorcycle", "preset=smoke", "train.steps=120", "threads=1")
+    conf = compose(*changes, "checkpoint_s=0.05")
     conf.splat.backend = resolve_backend(conf.splat.backend)
     (frozen,) = smoke_variants.iterdir()
     built = variant.load(frozen)

@@ -12,6 +12,7 @@ from typing import Any
 
 import msgspec
 import pytest
+from PIL import Image
 
 from xrgs.config import Conf
 from xrgs.errors import XrgsError
@@ -223,6 +224,10 @@ def test_a_missing_variant_is_built_and_has_to_be_the_same(
     variant_id = cell.identity().variant
     (tmp_path / "s" / "variants" / variant_id).rmdir()
     spoil_config(cell, lambda c: c["scene"].update(kind="folder"))  # an embedded one has no path
+    there = tmp_path / "there"
+    there.mkdir()
+    for grey in range(3):
+        Image.new("RGB", (64, 48), (grey,) * 3).save(there / f"{grey}.png")
     other = f"{variant_id[:16] if same_key else '0' * 16}-{'1' * 16}"
     requests: list[Any] = []
 
@@ -232,8 +237,8 @@ def test_a_missing_variant_is_built_and_has_to_be_the_same(
 
     monkeypatch.setattr(worker, "run_in_child", run)
     with pytest.raises(XrgsError, match="COLMAP" if same_key else "its photographs, or the code"):
-        rerun(cell.path, photographs="there")
-    assert requests == [("variant", "there", str(tmp_path / "s"))]
+        rerun(cell.path, photographs=str(there))
+    assert requests == [("variant", str(there), str(tmp_path / "s"))]
     assert not cell.path.with_name(f"{cell.id}.rerun-1").exists()
 
 
