@@ -12,7 +12,6 @@ _PREAMBLE = r"""\documentclass{article}
   \let\toprule\hline\let\midrule\hline\let\bottomrule\hline
   \def\cmidrule(##1)##2{\cline{##2}}}
 \usepackage{graphicx}
-\maxdeadcycles=10000 % a report of a hundred tables has no text between them
 """
 
 

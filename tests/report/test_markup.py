@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests import pdflatex
-from xrgs.report.markup import LATEX_PREAMBLE, to_latex, to_markdown
+from xrgs.report.markup import latex_file, to_latex, to_markdown
 from xrgs.runtime.text import TextTable, to_text
 
 TABLE = TextTable(
@@ -92,7 +92,7 @@ def test_latex_compiles(tmp_path: Path) -> None:
     best = frozenset((row, 0) for row in range(len(SIGNS)))
     spans = ((SIGNS[-1], 2), (SIGNS[0], 1))
     signs = TextTable(SIGNS[-1], SIGNS[1:], names, "lll", SIGNS, SIGNS[0], spans=spans, best=best)
-    tables = [*map(to_latex, (TABLE, SPANNED, wide, signs)), LATEX_PREAMBLE]
+    tables = [latex_file((TABLE, SPANNED, wide, signs)), latex_file([TABLE] * 120)]
     assert not pdflatex.errors_of(tables, tmp_path)
     assert "Undefined control sequence" in pdflatex.errors_of([*tables, r"\odd"], tmp_path)
 

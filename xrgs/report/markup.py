@@ -16,7 +16,9 @@ if TYPE_CHECKING:
 #: Shrinks a table that is wider than the text.
 _LATEX_FITTED = r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%"
 #: What a document needs for the tables of `to_latex`.
-LATEX_PREAMBLE = "% The document needs \\usepackage{booktabs} and \\usepackage{graphicx}.\n"
+_LATEX_PREAMBLE = "% The document needs \\usepackage{booktabs} and \\usepackage{graphicx}.\n"
+#: LaTeX takes 50 tables with no text between them ("100 consecutive dead cycles" at more).
+_MOST_FLOATS = 25
 
 
 def titled(text: str, condition: str) -> str:
@@ -97,6 +99,14 @@ def to_latex(table: TextTable) -> str:
             "",
         ]
     )
+
+
+def latex_file(tables: Sequence[TextTable]) -> str:
+    r"""Write tables as a file that a document of LaTeX includes by `\input`."""
+    texts = [to_latex(table) for table in tables]
+    for last in range(_MOST_FLOATS - 1, len(texts) - 1, _MOST_FLOATS):
+        texts[last] += "\\clearpage\n"
+    return _LATEX_PREAMBLE + "\n".join(texts)
 
 
 def _latex_spans(table: TextTable) -> list[str]:

@@ -20,7 +20,7 @@ from xrgs.report.context import contexts, decided_by_one_view
 from xrgs.report.external import with_external
 from xrgs.report.html import write_document
 from xrgs.report.joined import Choice, JoinedStore, report_name
-from xrgs.report.markup import LATEX_PREAMBLE, to_latex, to_markdown
+from xrgs.report.markup import latex_file, to_markdown
 from xrgs.report.paper import paper_tables, texture_tables, why_no_table, with_texture
 from xrgs.report.photographs import photographs, with_variants
 from xrgs.report.pictures import Picture, draw
@@ -206,8 +206,7 @@ def _write(
     drawn = draw(store, comparison, sweep.views, runs.curves, folder / "figures", pictures)
     _write_data(folder, sweep, comparison, runs)
     changes = _change_tables(tables)
-    latex = [to_latex(table) for table in changes if table.rows]
-    write_text(folder / "table.tex", LATEX_PREAMBLE + "\n".join(latex))
+    write_text(folder / "table.tex", latex_file([table for table in changes if table.rows]))
     textures = texture_tables(comparison, sweep.views, tables.contexts)
     everything = [*changes, *textures, *runs.tables(comparison.base), _provenance_table(sweep)]
     page = _markdown_page(sweep, comparison.base, everything, drawn, folder)
