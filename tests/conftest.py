@@ -134,7 +134,12 @@ def _composed(overrides: tuple[str, ...], _environment: tuple[tuple[str, str], .
 
 
 def composed(*overrides: str) -> config.Conf:
-    """Compose a config as `composing.compose` does, but equal ones once: Hydra takes 0.1 s each."""
+    """Compose a config as `composing.compose` does, but equal ones once: Hydra takes 0.1 s each.
+
+    `preset=laptop` stands for the default preset: tests know gsplat's own learning rates.
+    """
+    if not any(word.startswith(("preset=", "+sweeps=")) for word in overrides):
+        overrides = ("preset=laptop", *overrides)
     environment = sorted(item for item in os.environ.items() if item[0].startswith("XRGS_"))
     return deepcopy(_composed(overrides, tuple(environment)))
 

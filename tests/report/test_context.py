@@ -38,14 +38,19 @@ def test_it_names_what_a_reader_has_to_know(made: Any) -> None:
     assert context.of_all == f"{context.of_scores}; {context.of_times}"
 
 
+def test_rates_that_fit_are_named(made: Any) -> None:
+    configured(made.add(), splat={"optimizer": {"length_power": 0.5}})
+    assert found(made)[""].of_scores.startswith("3,000 steps, with learning rates that fit; HR")
+
+
 def test_what_differs_among_cells_is_listed(made: Any) -> None:
     configured(made.add())
     other = {"densify": {"prune_scale3d": 10.0}}
     configured(made.add("keep_large"), splat=other)
-    configured(made.add("mcmc"), splat={"strategy": "mcmc"})
+    configured(made.add("mcmc"), splat={"strategy": "mcmc", "optimizer": {"length_power": 0.5}})
     configured(made.add(scene="leaves"), train={"steps": 500})
     text = found(made)[""].of_scores
-    assert "3,000 or 500 steps" in text
+    assert "3,000 or 500 steps; " in text  # rates that fit are named where all cells have them
     assert "0.1 (baseline), 10 (keep_large) times the scene's scale" in text
     assert "are pruned, and none for their size in mcmc" in text
     assert "2 test views a scene" in text

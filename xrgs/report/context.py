@@ -112,6 +112,8 @@ def _sizes(configs: Sequence[Conf], *, tagged: bool) -> list[str]:
         return []
     sizes = _distinct(config.variant.long_side for config in configs)
     steps = f"{_distinct(config.train.steps for config in configs)} steps"
+    if all(config.splat.optimizer.length_power for config in configs):
+        steps += ", with learning rates that fit"
     if not tagged:
         size = "at their own size" if sizes == "0" else f"of at most {sizes} px"
         return [steps, f"photographs {size}"]
