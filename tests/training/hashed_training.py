@@ -15,9 +15,9 @@ import torch
 from torch import Tensor
 
 from xrgs import composing
-from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import PARAMETERS
+from xrgs.training.dataset import Dataset, LoadedView
 from xrgs.training.loop import train
 
 GAUSSIANS = 60_001

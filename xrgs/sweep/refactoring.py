@@ -15,23 +15,23 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from xrgs.capture import frozen, variant
 from xrgs.errors import StoreError, XrgsError
 from xrgs.evaluation import scoring
-from xrgs.experiment import identity
-from xrgs.experiment.store import Store
+from xrgs.mixture import saved_variant, variant
 from xrgs.runtime.progress import log_line
 from xrgs.safeio import refactorings
 from xrgs.safeio.refactorings import canonical
 from xrgs.safeio.sanitize import counted
-from xrgs.sweep import variants
+from xrgs.store import identity
+from xrgs.store.store import Store
+from xrgs.sweep import build_variants
 from xrgs.sweep.rerun import rerun
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from xrgs.experiment.cell_folder import CellFolder
     from xrgs.safeio.refactorings import Change
+    from xrgs.store.cell_folder import CellFolder
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ def _changes_of_variant(store: Store, cell: CellFolder) -> list[Change]:
     A variant that is not in the store, or does not say which code has built it, has none.
     """
     try:
-        built = frozen.read_manifest(store.variants / cell.identity().variant).code
+        built = saved_variant.read_manifest(store.variants / cell.identity().variant).code
     except StoreError:
         return []
     now = variant.code(cell.config().variant)
@@ -143,8 +143,10 @@ def _build_again(store: Store, variant_id: str, cell: CellFolder) -> None:
     with tempfile.TemporaryDirectory(prefix="xrgs-") as folder:
         other = Store(Path(folder) / "store")
         other.prepare()
-        again = frozen.read_manifest(other.variants / variants.build(cell.config(), other))
-    before = frozen.read_manifest(store.variants / variant_id)
+        again = saved_variant.read_manifest(
+            other.variants / build_variants.build(cell.config(), other)
+        )
+    before = saved_variant.read_manifest(store.variants / variant_id)
     then, now = (msgspec.to_builtins(manifest) for manifest in (before, again))
     different = [
         name for name in then if name not in {"id", "key", "code"} and then[name] != now[name]

@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 
 from tests.splat.scenes import noise
-from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.config import ComponentsConf, Conf
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.splat.settings import RasterSettings
 from xrgs.training import components
 from xrgs.training.components import Components, Step
+from xrgs.training.dataset import Dataset, LoadedView
 from xrgs.training.recorder import TrainingRecorder
 from xrgs.training.rendering import StepRenderer
 

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from xrgs.config import ComponentsConf, DensifyConf, identity_values, is_on
 from xrgs.errors import XrgsError
+from xrgs.registry import BUILT_IN, modules_of
 from xrgs.splat.gaussians import Gaussians
 from xrgs.splat.settings import DensifySettings
 from xrgs.splat.strategy.default import DefaultStrategy
@@ -38,7 +39,6 @@ from xrgs.training.components.skip_backward import SkipBackward
 from xrgs.training.components.supersampled import Supersampled
 from xrgs.training.components.view_scores import ErrorScore, MultiviewScore
 from xrgs.training.components.weighting import Weighting
-from xrgs.training.registry import BUILT_IN, modules_of
 
 Build = Callable[..., Components]
 

@@ -17,12 +17,12 @@ from tests.conftest import composed
 from tests.splat.scenes import noise
 from tests.training.components.conftest import make_view
 from tests.training.conftest import same
-from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.config import ComponentsConf, NoiseWeightingConf
 from xrgs.errors import XrgsError
 from xrgs.splat.gaussians import Gaussians
 from xrgs.training.components import Components, Step
 from xrgs.training.components.noise_weighting import NoiseWeighting
+from xrgs.training.dataset import Dataset, LoadedView
 from xrgs.training.loop import train
 
 Build = Callable[..., Components]

@@ -14,12 +14,12 @@ from torch.nn.functional import interpolate
 from tests.conftest import composed as compose
 from tests.splat.scenes import noise
 from tests.training.conftest import same
-from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.config import ComponentsConf, Conf
 from xrgs.errors import XrgsError
 from xrgs.splat.gaussians import Gaussians
 from xrgs.training.components import Components, Step, TrainingView
 from xrgs.training.components.resolution_schedule import ResolutionSchedule, kept_shares
+from xrgs.training.dataset import Dataset, LoadedView
 from xrgs.training.loop import train
 
 Build = Callable[..., Components]

@@ -12,12 +12,12 @@ from torch.nn.functional import avg_pool2d, interpolate
 
 from tests.splat.scenes import noise
 from tests.training.components.conftest import make_view
-from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.config import ComponentsConf, Conf
 from xrgs.splat.gaussians import from_points
 from xrgs.splat.rendering import rasterize_parameters
 from xrgs.training import components
 from xrgs.training.components import Components, Step
+from xrgs.training.dataset import Dataset, LoadedView
 from xrgs.training.seeding import seeded_generator
 
 Build = Callable[..., Components]

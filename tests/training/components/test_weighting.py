@@ -14,7 +14,6 @@ from torch import Tensor
 
 from tests.splat.scenes import noise
 from tests.training.components.conftest import make_view
-from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.config import ComponentsConf, Conf
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import Gaussians
@@ -28,6 +27,7 @@ from xrgs.training.components.weighting import (
     region_attenuations,
     scheduled_attenuation,
 )
+from xrgs.training.dataset import Dataset, LoadedView
 
 Build = Callable[..., Components]
 

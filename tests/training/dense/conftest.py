@@ -10,10 +10,10 @@ import torch
 from numpy.typing import NDArray
 from torch.nn.functional import avg_pool2d
 
-from xrgs.capture.dataset import Dataset, LoadedView
-from xrgs.capture.scenes import procedural, raycast, still_life
+from xrgs.photos.scenes import procedural, raycast, still_life
 from xrgs.splat.cameras import Camera
 from xrgs.splat.normalize import normalize_scene
+from xrgs.training.dataset import Dataset, LoadedView
 from xrgs.training.dense.levels import Level
 
 Array = NDArray[np.float64]

@@ -2,7 +2,7 @@
 
 To add a score of views, add a file with its function, and an entry to `METRICS`; `xrgs-store
 rescore` then computes it for cells that are done. Any other entry is a figure of the cell's
-summary, or follows from the PSNR of its views (`xrgs.experiment.results.over_views`). torch and
+summary, or follows from the PSNR of its views (`xrgs.store.results.over_views`). torch and
 kornia are imported where they are used, because plans and reports are made without them.
 """
 
@@ -39,7 +39,7 @@ __all__ = [
     "ssim",
 ]
 
-_BASE = ("evaluation/metrics/base.py", "capture/masks.py")
+_BASE = ("evaluation/metrics/base.py", "photos/masks.py")
 _PSNR = (*_BASE, "evaluation/metrics/psnr.py")
 _SSIM = (*_BASE, "evaluation/metrics/ssim.py")
 _LPIPS = (

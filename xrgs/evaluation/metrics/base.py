@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from xrgs.capture import masks
+from xrgs.photos import masks
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -41,12 +41,12 @@ if TYPE_CHECKING:
 
     from torch import Tensor
 
-    from xrgs.capture.dataset import Dataset
     from xrgs.config import ComponentsConf, SplatConf
     from xrgs.splat.cameras import Camera
     from xrgs.splat.gaussians import ActivatedGaussians, Gaussians
     from xrgs.splat.settings import DensifySettings
     from xrgs.splat.strategy.refinement import Groups
+    from xrgs.training.dataset import Dataset
 
 
 class TrainingView(Protocol):

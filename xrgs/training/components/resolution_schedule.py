@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Self
 import torch
 from torch import Tensor
 
-from xrgs.capture import masks
 from xrgs.errors import XrgsError
+from xrgs.photos import masks
 from xrgs.splat.cameras import Camera
 from xrgs.splat.loss import WINDOW
 from xrgs.splat.resample import resize

@@ -40,9 +40,10 @@ class Supersampled(Component):
         loss = L(D(render_k), I),    k_v = clamp(round(need_v), 1, factor)
 
     is the loss of the view. need_v says how many times as many pixels a side the view would need to
-    be as fine as the finest views of what it sees (`xrgs.capture.sampling.needed_factors`): about 1
-    for an HR view, which stays as it is, and about `variant.factor` for a degraded one. The view's
-    tag does not count: photographs that are hardly a mixture are all rendered at their own size.
+    be as fine as the finest views of what it sees (`xrgs.mixture.sampling_rate.needed_factors`):
+    about 1 for an HR view, which stays as it is, and about `variant.factor` for a degraded one. The
+    view's tag does not count: photographs that are hardly a mixture are all rendered at their own
+    size.
 
     D is the kernel by which the variant has made its LR views:
 
