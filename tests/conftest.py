@@ -176,7 +176,7 @@ def data() -> Dataset:
         ramp = torch.linspace(0, 1, width).expand(height, width)
         image = torch.stack([ramp, ramp.flip(1), torch.full_like(ramp, 0.5)], dim=-1)
         camera, rho = _camera(width, height), width / 60
-        views.append(LoadedView(f"v{number}", tag, camera, image, rho, need=1 / rho))
+        views.append(LoadedView(f"v{number}", tag, camera, image, rho, supersampling=1 / rho))
     colors = torch.rand(60, 3, generator=generator)
     return Dataset(tuple(views), tuple(views[:1]), points, colors, scene_scale=1.0, factor=5)
 

@@ -17,7 +17,6 @@ from PIL import Image
 
 from tests.conftest import composed
 from xrgs.config import Conf
-from xrgs.evaluation.scoring import scoring_code
 from xrgs.mixture import saved_variant, variant
 from xrgs.safeio import checksums
 from xrgs.safeio.atomic import write_json
@@ -25,6 +24,7 @@ from xrgs.store import provenance
 from xrgs.store.attempts import begin_attempt, plan_cell
 from xrgs.store.identity import cell_id, cell_identity
 from xrgs.store.schema import Provenance, RecordedCell, Summary
+from xrgs.store.scoring import scoring_code
 from xrgs.store.store import Store
 
 LABELS = ("baseline", "consistency")

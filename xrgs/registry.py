@@ -22,8 +22,6 @@ class ComponentEntry:
     """Class in that module."""
     reads: tuple[str, ...] = ()
     """Further keys of `components` that the class reads."""
-    helpers: tuple[str, ...] = ()
-    """Further modules of `xrgs.training.components` that the class uses."""
 
 
 #: In the order in which hooks run. The weights of views come after `consistency`, since they
@@ -39,7 +37,6 @@ BUILT_IN: Mapping[str, ComponentEntry] = {
             "region_weighting",
             "hybrid_schedule",
         ),
-        helpers=("texture",),
     ),
     "noise_weighting": ComponentEntry("noise_weighting", "NoiseWeighting"),
     "gradient_scaling": ComponentEntry("gradient_scaling", "GradientScaling"),
@@ -48,33 +45,31 @@ BUILT_IN: Mapping[str, ComponentEntry] = {
     "curriculum": ComponentEntry("curriculum", "Curriculum"),
     "mip": ComponentEntry("mip", "Mip"),
     "render_scale": ComponentEntry("render_scale", "RenderScale"),
-    "supersampled": ComponentEntry(
-        "supersampled", "Supersampled", reads=("formation",), helpers=("formation", "adam")
-    ),
+    "supersampled": ComponentEntry("supersampled", "Supersampled", reads=("formation",)),
     "resolution_schedule": ComponentEntry("resolution_schedule", "ResolutionSchedule"),
     "skip_backward": ComponentEntry("skip_backward", "SkipBackward"),
     "multiview_score": ComponentEntry("view_scores", "MultiviewScore"),
     "error_score": ComponentEntry("view_scores", "ErrorScore"),
     "natural_selection": ComponentEntry("natural_selection", "NaturalSelection"),
-    "exposure": ComponentEntry("exposure", "Exposure", helpers=("adam",)),
+    "exposure": ComponentEntry("exposure", "Exposure"),
     "regularization": ComponentEntry("regularization", "Regularization"),
 }
 
 
-def modules_of(key: str) -> tuple[str, ...]:
-    """Return the source files that implement a key of `components`.
+def file_of(key: str) -> str | None:
+    """Return the source file of the component that a key of `components` switches on.
 
     Args:
         key: A key of `BUILT_IN`, or one that an entry reads. `plugins` and `count_matched` have no
             component here.
 
     Returns:
-        Paths in the package, such as `training/components/weighting.py`; none without a component.
+        Its path in the package, such as `training/components/weighting.py`; None without one.
     """
     for own_key, entry in BUILT_IN.items():
         if key == own_key or key in entry.reads:
-            return tuple(f"{_FOLDER}/{name}.py" for name in (entry.module, *entry.helpers))
-    return ()
+            return f"{_FOLDER}/{entry.module}.py"
+    return None
 
 
 def order_of(keys: Iterable[str]) -> str:

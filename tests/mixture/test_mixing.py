@@ -122,20 +122,20 @@ def test_by_sampling_rate_the_highest_are_hr_and_nothing_is_degraded(
     high, low = of(made, "train", "HR"), of(made, "train", "LR")
     assert len(high) == round(0.3 * 9)
     assert len(high) + len(low) == 9
-    assert min(v.rho for v in high) >= max(v.rho for v in low)
+    assert min(v.sampling_rate for v in high) >= max(v.sampling_rate for v in low)
     assert not of(made, "original", "HR")
     assert {(v.width, v.height) for v in made.views} == {(160, 120)}
     assert given == [[f"sfm/{i:05d}.png" for i in range(VIEWS)]]
     assert made.report["degradation"] == "none"
     assert made.report["pose_error"] == {}
-    assert made.report["rho"]["HR"][0] == min(v.rho for v in high)
+    assert made.report["rho"]["HR"][0] == min(v.sampling_rate for v in high)
 
 
 def test_photographs_of_one_resolution_are_said_to_make_no_mixture(mix: Mix) -> None:
     """The embedded scene's cameras are all about as far away: rho differs by 15 % at most."""
     made = mix(tags="sampling_rate")
     note, need = made.report["notes"]
-    rho = [view.rho for view in made.views if view.split == "train"]
+    rho = [view.sampling_rate for view in made.views if view.split == "train"]
     assert "variant.tags=sampling_rate is meaningless" in note
     assert f"rho is {min(rho):.3f} to {max(rho):.3f}" in note
     assert need == (
@@ -147,8 +147,8 @@ def test_photographs_of_one_resolution_are_said_to_make_no_mixture(mix: Mix) -> 
 def test_a_threshold_of_the_rate_takes_those_above_it(mix: Mix) -> None:
     made = mix(tags="sampling_rate", hr_above=0.93)
     assert of(made, "train", "HR")
-    assert all(v.rho >= 0.93 for v in of(made, "train", "HR"))
-    assert all(v.rho < 0.93 for v in of(made, "train", "LR"))
+    assert all(v.sampling_rate >= 0.93 for v in of(made, "train", "HR"))
+    assert all(v.sampling_rate < 0.93 for v in of(made, "train", "LR"))
 
 
 def test_by_distance_the_closest_are_hr(mix: Mix) -> None:
@@ -175,7 +175,7 @@ def test_by_megapixels_the_larger_photographs_are_hr(
     assert all((v.width, v.height) == (80, 60) for v in of(made, "train", "LR"))
     assert not of(made, "original", "HR")
     assert made.report["rho"]["LR"][1] == pytest.approx(0.5, abs=0.1)
-    assert round(min(view.need for view in of(made, "train", "LR"))) == 2
+    assert round(min(view.supersampling for view in of(made, "train", "LR"))) == 2
     assert made.report["notes"][-1].endswith("renders 6 of 9 of the views larger")
     for view in of(made, "test", "HR"):  # at its own full size
         assert (view.width, view.height) == ((160, 120) if number(view) % 3 == 0 else (80, 60))
@@ -213,8 +213,8 @@ def test_each_degraded_view_has_its_original_from_the_same_pose(mix: Mix) -> Non
         assert np.array_equal(high.viewmat, view.viewmat)
         assert (high.width, high.height) == (160, 120) == (view.width * 5, view.height * 5)
         assert high.K[:2] == pytest.approx(view.K[:2] * 5)
-        assert view.need == pytest.approx(5 * high.need, rel=0.01)
-        assert high.need == pytest.approx(1, rel=0.2)
+        assert view.supersampling == pytest.approx(5 * high.supersampling, rel=0.01)
+        assert high.supersampling == pytest.approx(1, rel=0.2)
         shrunk = images.resize(images.read(high.file), view.width, view.height)
         # The lens is nearly a pinhole, so that undistortion and downsampling commute.
         assert np.abs(shrunk - images.read(view.file)).mean() < 0.01
@@ -228,9 +228,11 @@ def test_a_degradation_may_keep_the_size(mix: Mix, given: list[list[str]], how: 
     for view in of(made, "train", "LR"):
         before, after = images.read(originals[view.name].file), images.read(view.file)
         assert 0.005 < np.abs(before - after).mean() < 0.1
-        assert view.rho == originals[view.name].rho  # px per unit; not what is in them
+        assert (
+            view.sampling_rate == originals[view.name].sampling_rate
+        )  # px per unit; not what is in them
         resolved = {"jpeg": 1, "digital_zoom": 5}[how]
-        assert view.need == pytest.approx(resolved * originals[view.name].need)
+        assert view.supersampling == pytest.approx(resolved * originals[view.name].supersampling)
     low = {number(v) for v in of(made, "train", "LR")}
     assert given[0] == [f"{'sfm_lr' if i in low else 'sfm'}/{i:05d}.png" for i in range(VIEWS)]
 
@@ -243,7 +245,7 @@ def test_lr_views_of_other_kernels_are_smaller(mix: Mix, given: list[list[str]],
     assert {v.name for v in low} == originals.keys()
     for view in low:
         assert (view.width, view.height) == (32, 24)
-        assert view.rho == pytest.approx(originals[view.name].rho / 5)
+        assert view.sampling_rate == pytest.approx(originals[view.name].sampling_rate / 5)
         high = images.read(originals[view.name].file)
         assert 0 < np.abs(images.resize(high, 32, 24) - images.read(view.file)).mean() < 0.1
     numbers = {number(v) for v in low}
@@ -532,4 +534,4 @@ def test_a_collection_of_many_cameras_is_registered(
         width, height = by_name[view.name]
         assert 0 <= round(width * scale) - view.width < 2
         assert 0 <= round(height * scale) - view.height < 2
-    assert min(view.rho for view in made.views) < 0.8  # 0.72 when this was written
+    assert min(view.sampling_rate for view in made.views) < 0.8  # 0.72 when this was written

@@ -36,7 +36,12 @@ def test_a_loaded_variant_is_the_one_that_was_built(stereo_variant: Variant) -> 
     assert np.array_equal(loaded.colors, stereo_variant.colors)
     for a, b in zip(loaded.views, stereo_variant.views, strict=True):
         assert (a.name, a.file, a.split, a.tag) == (b.name, b.file, b.split, b.tag)
-        assert (a.width, a.height, a.rho, a.need) == (b.width, b.height, b.rho, b.need)
+        assert (a.width, a.height, a.sampling_rate, a.supersampling) == (
+            b.width,
+            b.height,
+            b.sampling_rate,
+            b.supersampling,
+        )
         assert np.array_equal(a.K, b.K)
         assert np.array_equal(a.viewmat, b.viewmat)
 

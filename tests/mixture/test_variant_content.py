@@ -84,10 +84,10 @@ def test_points_have_the_colour_of_the_pixels_they_project_to(procedural_variant
 
 
 def test_rho_is_the_sampling_rate_over_the_largest(procedural_variant: Variant) -> None:
-    rho = {(view.split, view.name): view.rho for view in procedural_variant.views}
+    rho = {(view.split, view.name): view.sampling_rate for view in procedural_variant.views}
     assert max(rho.values()) == 1
     for view in select(procedural_variant, "train", "LR"):
-        assert view.rho == pytest.approx(rho["original", view.name] / 5)
+        assert view.sampling_rate == pytest.approx(rho["original", view.name] / 5)
     report = procedural_variant.report["rho"]
     assert 0 < report["LR"][0] < report["LR"][2] <= 0.2 + 1e-9 < report["HR"][0] <= 1
 

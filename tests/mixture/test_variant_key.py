@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -51,60 +50,89 @@ def keys(configured: Make) -> Callable[[], dict[str, str]]:
 def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A copy of the package's source files, from which digests are made."""
     copy = tmp_path / "xrgs"
-    shutil.copytree(code.PACKAGE / "capture", copy / "capture")
+    for folder in ("mixture", "photos"):
+        shutil.copytree(code.PACKAGE / folder, copy / folder)
     monkeypatch.setattr(code, "PACKAGE", copy)
     return copy
 
 
-def imported_modules(file: Path) -> set[str]:
-    """The files in capture/ that a file imports, at its top, in a function or for types alone."""
-    found: set[str] = set()
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("xrgs.capture"):
-            for alias in node.names:
-                parts = f"{node.module}.{alias.name}".split(".")[1:]
-                while not (code.PACKAGE / "/".join(parts)).with_suffix(".py").is_file():
-                    if (code.PACKAGE / "/".join(parts) / "__init__.py").is_file():
-                        parts.append("__init__")
-                    else:
-                        parts.pop()
-                found.add("/".join(parts) + ".py")
-    return found
+def add_to(file: Path) -> None:
+    """Add a line of code at the end of a file."""
+    with file.open("a") as stream:
+        stream.write("\nMORE = 1\n")
 
 
-def test_the_code_of_a_key_is_all_that_making_a_variant_imports(configured: Make) -> None:
-    """Scenes have fingerprints; registries, notes and reports of failed scenes decide no image."""
-    not_covered = {
-        "capture/__init__.py",
-        "mixture/blur.py",
+def test_every_file_of_photos_and_mixture_counts_always_or_with_a_part(
+    package: Path, configured: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A line of code at the end of each file in turn; registries and downloads don't count."""
+    monkeypatch.setattr(variant.poses, "fingerprint", lambda _: "poses")
+
+    def codes() -> list[dict[str, str]]:
+        confs = [configured(**change, poses="anything") for change in CHANGES.values()]
+        return [
+            *(variant.all_code(SCENE, conf) for conf in confs),
+            *({kind: scenes.code_of(kind)} for kind in scenes.KINDS),
+        ]
+
+    before, uncounted = codes(), set()
+    for file in [file for name in ("mixture", "photos") for file in (package / name).rglob("*.py")]:
+        text = file.read_text()
+        add_to(file)
+        if codes() == before:
+            uncounted.add(file.relative_to(package).as_posix())
+        file.write_text(text)
+    assert uncounted == {
         "mixture/degradations/__init__.py",
-        "mixture/paths.py",
         "mixture/tags/__init__.py",
+        "photos/scenes/kinds.py",
+        *(f"photos/download/{name}.py" for name in ("__init__", "http", "scenes", "unpack")),
     }
-    reached: set[str] = set()
-    pending = {"mixture/variant.py"}
-    while pending:
-        file = pending.pop()
-        reached.add(file)
-        pending |= {
-            name
-            for name in imported_modules(code.PACKAGE / file)
-            if not name.startswith("photos/scenes/")
-        } - reached
-    covered: set[str] = set()
-    for change in CHANGES.values():
-        for files in variant.sources(configured(**change, poses="anything")).values():
-            covered.update(files)
-    assert "photos/lens.py" in reached
-    assert covered == reached - not_covered
+
+
+@pytest.mark.parametrize(
+    ("name", "counts"),
+    [
+        ("mixture/new.py", True),
+        ("photos/new.py", True),
+        ("mixture/poses/new.py", False),
+        ("mixture/degradations/new.py", False),
+        ("mixture/tags/new.py", False),
+        ("photos/scenes/new.py", False),
+        ("photos/download/new.py", False),
+        ("new.py", False),
+    ],
+)
+def test_a_file_that_is_added_counts_where_its_folder_does(
+    keys: Callable[[], dict[str, str]], package: Path, name: str, counts: bool
+) -> None:
+    before = keys()
+    (package / name).write_text("MORE = 1\n")
+    changed = {name for name, key in keys().items() if key != before[name]}
+    assert changed == (set(CHANGES) if counts else set())
+
+
+def test_a_kind_of_scenes_counts_where_it_is_on(
+    keys: Callable[[], dict[str, str]], package: Path
+) -> None:
+    before, procedural = keys(), scenes.code_of("procedural")
+    add_to(package / "photos/scenes/still_life.py")  # that the procedural scene imports
+    assert keys() == before
+    assert scenes.code_of("procedural") != procedural
+    add_to(package / "photos/scenes/motorcycle.py")
+    assert not set(keys().values()) & set(before.values())
 
 
 def test_each_degradation_and_policy_has_a_module_of_its_name(configured: Make) -> None:
     assert CHANGES.keys() == degradations.DEGRADATIONS.keys() | tags.POLICIES.keys()
-    assert not variant.sources(configured(degradation="none")).keys() - {"core"}
-    for name, change in CHANGES.items():
-        (file,) = variant.sources(configured(**change)).keys() - {"core"}
-        assert variant.sources(configured(**change))[file][0].endswith(f"/{name}.py")
+    for part, names in (("degradations", degradations.DEGRADATIONS), ("tags", tags.POLICIES)):
+        assert all((code.PACKAGE / f"mixture/{part}/{name}.py").is_file() for name in names)
+    assert not variant.code(configured(degradation="none")).keys() - {"core"}
+    assert {name for change in CHANGES.values() for name in variant.code(configured(**change))} == {
+        "core",
+        "degradation",
+        "tags",
+    }
 
 
 def test_the_code_of_a_part_changes_the_keys_that_use_it(
@@ -113,7 +141,7 @@ def test_the_code_of_a_part_changes_the_keys_that_use_it(
     before = keys()
     assert len(set(before.values())) == len(CHANGES)
     for part, folder in (("jpeg", "degradations"), ("distance", "tags")):
-        file = package / "capture" / folder / f"{part}.py"
+        file = package / "mixture" / folder / f"{part}.py"
         whole = file.read_text()
         file.write_text(f"{whole}\nLATER = 1\n")
         changed = keys()
@@ -154,6 +182,7 @@ def test_what_is_added_changes_no_key(
     (package / "mixture/tags/age.py").write_text("class Age: ...")
     monkeypatch.setitem(degradations.DEGRADATIONS, "blur", degradations.Degradation(blur))
     monkeypatch.setitem(tags.POLICIES, "age", tags.POLICIES["megapixels"])
+    (package / "photos/scenes/another.py").write_text("class Another: ...")
     monkeypatch.setitem(scenes.KINDS, "another", scenes.KINDS["motorcycle"])
     assert keys() == before
     added = {

@@ -13,12 +13,12 @@ from PIL import Image
 
 from tests.conftest import composed
 from xrgs.evaluation.metrics import VIEW_METRICS
-from xrgs.evaluation.scoring import scoring_code
 from xrgs.report.collect import Sweep, read_cells
 from xrgs.safeio.atomic import write_json
 from xrgs.store.attempts import begin_attempt
 from xrgs.store.cell_folder import CellFolder
 from xrgs.store.schema import Identity, Provenance, RecordedCell
+from xrgs.store.scoring import scoring_code
 from xrgs.store.store import Store
 
 SUMMARY = {

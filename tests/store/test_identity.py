@@ -22,27 +22,16 @@ import pytest
 from xrgs import config
 from xrgs.config import Conf
 from xrgs.errors import XrgsError
-from xrgs.evaluation import metrics, scoring
-from xrgs.registry import BUILT_IN, modules_of
+from xrgs.evaluation import metrics
+from xrgs.registry import BUILT_IN, file_of
 from xrgs.safeio import code, refactorings
 from xrgs.splat import backend
 from xrgs.splat.backend import resolve_backend
-from xrgs.store import identity
+from xrgs.store import identity, scoring
 
 pytest.importorskip("xrgs._native", reason="the kernels were not built")
 
 PACKAGE = Path(identity.__file__).parents[1]
-#: Python files of the model and of training whose change changes no trained number.
-NO_NUMBERS = {
-    "splat/__init__.py",
-    "formats/gsplat_api.py",  # gsplat's signature, for users
-    "splat/torch_defaults.py",  # restores torch's own defaults, which every sweep has
-    "formats/ply.py",  # saves the trained Gaussians, exactly as its own tests say
-    *(f"splat/{name}.py" for name in ("files", "glb", "saved", "spz", "similarity")),  # the same
-    "training/__init__.py",
-    "registry.py",  # identities have the order of the components that are on
-    "plugins.py",
-}
 
 
 def cell_id(conf: Conf, variant: str = "v") -> str:
@@ -270,29 +259,109 @@ def test_the_renderer_of_gsplat_and_its_version_count_where_it_renders(
     assert ids_after(edit, known) == (set(confs), {"gsplat"})
 
 
-def test_every_file_of_the_model_and_of_training_is_hashed_or_changes_no_number() -> None:
-    of_components = (module for key in BUILT_IN for module in modules_of(key))
-    of_starts = (name for names in identity.START_CODE.values() for name in names)
-    hashed = {
-        file.relative_to(PACKAGE).as_posix()
-        for file in code.sources(
-            *identity.CORE, *identity.BACKEND_CODE["gsplat"], *of_components, *of_starts
+def test_every_file_of_the_model_and_of_training_counts_always_or_with_a_part(
+    package: Path, confs: dict[str, Conf], compose: Callable[..., Conf]
+) -> None:
+    """A line of code at the end of each file in turn: which ids change."""
+    every = confs | {"dense": compose("splat.init=dense"), "mcmc": compose("splat.strategy=mcmc")}
+    components = [key for key in BUILT_IN if file_of(key)]
+    before = {name: identity.cell_identity(conf, "v").code for name, conf in every.items()}
+    on_gsplat = identity.code_now("gsplat")
+    of_each = {key: identity.code_now("native", (key,))[key] for key in components}
+    uncounted = set()
+    files = {file for folder in ("splat", "training") for file in (package / folder).rglob("*.py")}
+    for file in files:
+        text = file.read_text()
+        file.write_text(f"{text}\nMORE = 1\n")
+        identity.training_code.cache_clear()
+        after = {name: identity.cell_identity(conf, "v").code for name, conf in every.items()}
+        counts = (
+            after != before
+            or identity.code_now("gsplat") != on_gsplat
+            or any(identity.code_now("native", (k,))[k] != of_each[k] for k in components)
         )
-    }
-    files = {
-        file.relative_to(PACKAGE).as_posix()
-        for folder in ("splat", "training")
-        for file in (PACKAGE / folder).rglob("*.py")
-    }
-    assert files - hashed == NO_NUMBERS
-    assert hashed - files == {"training/dataset.py", "safeio/npz.py"}
+        if not counts:
+            uncounted.add(file.relative_to(package).as_posix())
+        file.write_text(text)
+    assert uncounted == set()
+
+
+@pytest.mark.parametrize(
+    ("name", "changed"),
+    [
+        ("splat/new.py", {"torch", "native"}),
+        ("training/new.py", {"torch", "native"}),
+        ("splat/torch/new.py", {"torch"}),
+        ("splat/native/new.py", {"native"}),
+        ("csrc/new.cpp", {"native"}),
+        ("splat/gsplat/new.py", set()),
+        ("training/dense/new.py", set()),
+        ("splat/strategy/new.py", set()),
+        ("training/components/new.py", set()),
+        ("formats/new.py", set()),
+        ("mixture/new.py", set()),
+        ("photos/new.py", set()),
+        ("safeio/new.py", set()),
+        ("evaluation/new.py", set()),
+        ("new.py", set()),
+    ],
+)
+def test_a_file_that_is_added_counts_where_its_folder_does(
+    package: Path, confs: dict[str, Conf], name: str, changed: set[str]
+) -> None:
+    def add() -> None:
+        (package / name).write_text("int more = 1;\n" if name.endswith(".cpp") else "MORE = 1\n")
+
+    assert ids_after(add, confs)[1] == {conf for conf in confs if conf.split()[1] in changed}
+
+
+def test_what_the_core_begins_to_import_counts(package: Path, confs: dict[str, Conf]) -> None:
+    """A file of components that a file of the core imports, and what that one imports."""
+    folder = package / "training/components"
+    (folder / "new.py").write_text("from xrgs.training.components.newer import MORE\n")
+    (folder / "newer.py").write_text("MORE = 1\n")
+    loop = package / "training/loop.py"
+    loop.write_text(f"{loop.read_text()}\nfrom xrgs.training.components import new\n")
+    edit = edited(folder / "newer.py", "MORE = 1", "MORE = 2")
+    assert ids_after(edit, confs)[1] == set(confs)
+
+
+def test_an_import_of_our_own_counts(package: Path, confs: dict[str, Conf]) -> None:
+    edit = edited(
+        package / "training/loop.py",
+        "from xrgs.splat.loss import Target",
+        "from xrgs.splat.native.loss import Target",
+    )
+    assert ids_after(edit, confs)[1] == set(confs)
+
+
+def test_a_strategy_counts_where_it_is_on(
+    package: Path, confs: dict[str, Conf], compose: Callable[..., Conf]
+) -> None:
+    both = confs | {"mcmc": compose("splat.strategy=mcmc")}
+    file = package / "splat/strategy/mcmc.py"
+    edit = lambda: file.write_text(f"{file.read_text()}\nMORE = 1\n")  # noqa: E731
+    assert ids_after(edit, both)[1] == {"mcmc"}
+    file = package / "splat/strategy/default.py"
+    assert ids_after(edit, both)[1] == set(confs)
+    file = package / "splat/strategy/ops.py"  # that both import
+    assert ids_after(edit, both)[1] == set(both)
+
+
+def test_what_a_component_imports_counts_with_it(package: Path) -> None:
+    before = {key: identity.code_now("native", (key,))[key] for key in BUILT_IN}
+    file = package / "training/components/adam.py"
+    file.write_text(f"{file.read_text()}\nMORE = 1\n")
+    after = {key: identity.code_now("native", (key,))[key] for key in BUILT_IN}
+    assert {key for key in before if after[key] != before[key]} == {"supersampled", "exposure"}
 
 
 def test_each_component_of_the_config_has_a_module() -> None:
     keys = {field.name for field in dataclasses.fields(config.ComponentsConf)}
     for key in keys - {"plugins", "count_matched"}:
-        assert all((PACKAGE / name).is_file() for name in modules_of(key)), key
-        assert modules_of(key), key
+        file = file_of(key)
+        assert file is not None, key
+        assert (PACKAGE / file).is_file(), key
 
 
 # 4. Scores are apart.

@@ -181,7 +181,7 @@ def test_it_says_whether_it_is_a_mixture(
     mixed: Variant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, needs: list[float], said: str
 ) -> None:
     original, test, train, _ = mixed.views
-    views = [replace(train, name=str(i), need=need) for i, need in enumerate(needs)]
+    views = [replace(train, name=str(i), supersampling=need) for i, need in enumerate(needs)]
     made = replace(mixed, views=(original, test, *views))
     monkeypatch.setattr(variant, "load", lambda _: made)
     monkeypatch.setattr(inspect, "read_report", lambda _: SfmReport())

@@ -193,7 +193,7 @@ def sizes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[Conf], e
 
     def view(name: str, split: str, tag: str, side: int, need: float) -> SimpleNamespace:
         size = {"width": side, "height": side}
-        return SimpleNamespace(name=name, split=split, tag=tag, need=need, **size)
+        return SimpleNamespace(name=name, split=split, tag=tag, supersampling=need, **size)
 
     made = [
         *(view(name, "train", "HR", 200, 1.2) for name in "ab"),

@@ -28,7 +28,7 @@ def make_view(folder: Path, name: str, split: str, tag: str, size: tuple[int, in
     viewmat[:3, 3] = (-0.3 * number, 0.1 * (number % 2), 0.05 * number)
     K = np.array([[size[0], 0, size[0] / 2], [0, size[0], size[1] / 2], [0, 0, 1.0]])
     finer = HR[0] / size[0]
-    return View(name, file, split, tag, *size, K, viewmat, 1 / finer, need=finer)
+    return View(name, file, split, tag, *size, K, viewmat, 1 / finer, supersampling=finer)
 
 
 @pytest.fixture
@@ -59,8 +59,8 @@ def test_mixed_is_the_default_and_takes_the_views_as_they_are(variant: Variant) 
         ("v4", "LR"),
     ]
     assert [v.name for v in data.test] == ["v0"]
-    assert [v.rho for v in data.train] == [1, 0.5, 0.5, 0.5]
-    assert [v.need for v in data.train] == [1, 2, 2, 2]
+    assert [v.sampling_rate for v in data.train] == [1, 0.5, 0.5, 0.5]
+    assert [v.supersampling for v in data.train] == [1, 2, 2, 2]
     for view in data.train:
         size = HR if view.tag == "HR" else LR
         assert view.image.shape == (size[1], size[0], 3)
@@ -79,7 +79,7 @@ def test_a_photograph_is_8_bits_in_memory_and_read_png_on_demand(variant: Varian
 
 def test_all_hr_takes_originals_from_the_same_poses(variant: Variant) -> None:
     mixed, high = dataset.load(variant), dataset.load(variant, "all_hr")
-    assert [(v.name, v.tag, v.rho) for v in high.train] == [
+    assert [(v.name, v.tag, v.sampling_rate) for v in high.train] == [
         (f"v{i}", "HR", 1.0) for i in range(1, 5)
     ]
     assert [grey(v) for v in high.train] == [0.15, 0.4, 0.45, 0.5]  # originals from v2 on

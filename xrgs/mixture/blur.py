@@ -57,7 +57,10 @@ def lr_blur(views: Sequence[View]) -> float | None:
     )
     if not hr or not lr:
         return None
-    finer = float(np.median([view.rho for view in hr]) / np.median([view.rho for view in lr]))
+    finer = float(
+        np.median([view.sampling_rate for view in hr])
+        / np.median([view.sampling_rate for view in lr])
+    )
     sharp, blurred = _mean_log_power(hr, finer), _mean_log_power(lr, 1.0)
     if sharp is None or blurred is None:
         return None

@@ -257,7 +257,7 @@ def _tags_report(inputs: _Inputs, views: tuple[View, ...]) -> dict[str, Any]:
     """Report the class of each view, and minimum, median and maximum of rho per class."""
     names, split = inputs.photos.names, inputs.split
     rates = {
-        tag: [view.rho for view in views if (view.split, view.tag) == ("train", tag)]
+        tag: [view.sampling_rate for view in views if (view.split, view.tag) == ("train", tag)]
         for tag in ("HR", "LR")
     }
     return {
@@ -297,7 +297,7 @@ def _class_notes(inputs: _Inputs, rates: Mapping[str, list[float]]) -> list[str]
 def _with_needs(
     inputs: _Inputs, views: tuple[View, ...], points: sampling_rate.Array
 ) -> tuple[View, ...]:
-    """Return the views with the factors by which they need more px (`View.need`)."""
+    """Return the views with the factors by which they need more px (`View.supersampling`)."""
     zooms = resolve_degradation(inputs.conf) == "digital_zoom"
     points = points[:: math.ceil(len(points) / _MOST_COMPARED)]
     rates = []
@@ -310,16 +310,16 @@ def _with_needs(
         rates.append(at_points / inputs.conf.factor if zooms and degraded else at_points)
     trained = np.array([view.split == "train" for view in views])
     needs = sampling_rate.needed_factors(np.stack(rates), trained)
-    return tuple(replace(view, need=need) for view, need in zip(views, needs, strict=True))
+    return tuple(replace(view, supersampling=need) for view, need in zip(views, needs, strict=True))
 
 
 def _need_notes(inputs: _Inputs, views: tuple[View, ...]) -> list[str]:
     """Say which training views are supersampled, where they are not the degraded ones."""
     training = [view for view in views if view.split == "train"]
-    larger = [round(view.need) > 1 for view in training]
+    larger = [round(view.supersampling) > 1 for view in training]
     if inputs.degraded and larger == [view.tag == "LR" for view in training]:
         return []
-    largest = max(view.need for view in training)
+    largest = max(view.supersampling for view in training)
     which = f"{sum(larger)} of {len(training)}" if any(larger) else "none"
     return [
         f"sampling rates of training views differ by {largest:.1f} where they show the same points:"
@@ -384,5 +384,5 @@ def _write_undistorted(
         rates.append(sampling_rate.sampling_rate(K, depths[i]))
     rhos = sampling_rate.relative_to_largest(rates)
     notes = [f"views left out, whose masks leave no pixel: {listed(hidden)}"] if hidden else []
-    views = [replace(view, rho=rho) for view, rho in zip(views, rhos, strict=True)]
+    views = [replace(view, sampling_rate=rho) for view, rho in zip(views, rhos, strict=True)]
     return tuple(sorted(views, key=lambda view: (view.split, view.name))), notes

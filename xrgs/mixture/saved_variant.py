@@ -53,9 +53,9 @@ class ViewEntry(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=T
     height: _Side
     K: Annotated[list[_Row3], Meta(min_length=3, max_length=3)]
     viewmat: Annotated[list[_Row4], Meta(min_length=4, max_length=4)]
-    rho: Annotated[float, Meta(gt=0, le=1)]
+    sampling_rate: Annotated[float, Meta(gt=0, le=1)] = msgspec.field(name="rho")
     mask: str | None = None
-    need: Annotated[float, Meta(gt=0)] = 1.0
+    supersampling: Annotated[float, Meta(gt=0)] = msgspec.field(name="need", default=1.0)
 
 
 class Manifest(Struct, frozen=True, forbid_unknown_fields=True):

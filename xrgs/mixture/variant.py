@@ -21,7 +21,7 @@ from xrgs.photos import scenes
 from xrgs.runtime import lease
 from xrgs.safeio import checksums
 from xrgs.safeio.atomic import write_json
-from xrgs.safeio.code import code_digest
+from xrgs.safeio.code import CodeFolders, code_digest
 from xrgs.safeio.files import remove_path
 from xrgs.safeio.hashing import digest
 from xrgs.safeio.records import list_folder
@@ -32,43 +32,32 @@ if TYPE_CHECKING:
 
     from xrgs.config import SceneConf, VariantConf
 
-__all__ = ["CorruptVariant", "build", "code", "failure", "find", "key", "load", "verify"]
+__all__ = [
+    "CorruptVariant",
+    "all_code",
+    "build",
+    "code",
+    "failure",
+    "find",
+    "key",
+    "load",
+    "verify",
+]
 
 _log = logging.getLogger(__name__)
 
-#: The source files that decide what every variant is: a change in one of them changes every key,
-#: unless it is declared (`xrgs.safeio.refactorings`).
-CORE = (
-    "mixture/pose_error.py",
-    "photos/colour.py",
-    "photos/tiff.py",
-    "photos/exif.py",
-    "mixture/saved_variant.py",
-    "photos/images.py",
-    "photos/lens.py",
-    "photos/masks.py",
-    "mixture/mixing.py",
-    "mixture/own_cameras.py",
-    "mixture/photographs.py",
-    "mixture/sfm_retries.py",
-    "mixture/sampling_rate.py",
-    "safeio/checksums.py",
-    "mixture/sfm.py",
-    "mixture/split.py",
-    "mixture/variant.py",
-    "mixture/views.py",
-)
-#: The source files that read given poses.
-POSES = (
-    "mixture/colmap.py",
-    "photos/foreign.py",
-    "mixture/poses/__init__.py",
-    "mixture/poses/checks.py",
-    "mixture/poses/colmap.py",
-    "mixture/poses/given.py",
-    "mixture/poses/transforms.py",
-    "mixture/poses/world.py",
-    "mixture/triangulation.py",
+_DEGRADATIONS, _TAGS = "mixture/degradations", "mixture/tags"
+#: The code that makes variants of photographs. Every file counts always, but those that read given
+#: poses, degrade views and tag views: these count where they are on.
+_CODE = CodeFolders(
+    folders=("mixture",),
+    whole_parts=("mixture/poses",),
+    folders_of_parts=(_DEGRADATIONS, _TAGS),
+    parts=frozenset(
+        {f"{_DEGRADATIONS}/{name}.py" for name in DEGRADATIONS}
+        | {f"{_TAGS}/{name}.py" for name in POLICIES}
+    ),
+    registries=frozenset({f"{_DEGRADATIONS}/__init__.py", f"{_TAGS}/__init__.py"}),
 )
 
 
@@ -99,27 +88,25 @@ def _settings(conf: VariantConf) -> dict[str, Any]:
 
 
 def code(conf: VariantConf) -> dict[str, str]:
-    """Return the digest of each part of the code that decides what a variant of this config is."""
+    """Return the digest of each part of the code that makes a variant of a scene's photographs.
+
+    The code that provides these counts in the fingerprint of the scene.
+    """
+    files = {"core": _CODE.core()}
+    if conf.poses is not None:
+        files["poses"] = ("mixture/poses",)
+    if (name := resolve_degradation(conf)) in DEGRADATIONS:
+        files["degradation"] = _CODE.part(f"{_DEGRADATIONS}/{name}.py")
+    if conf.tags in POLICIES:
+        files["tags"] = _CODE.part(f"{_TAGS}/{conf.tags}.py")
     return {
-        part: canonical(f"variant/{part}", code_digest(*files))
-        for part, files in sources(conf).items()
+        part: canonical(f"variant/{part}", code_digest(*names)) for part, names in files.items()
     }
 
 
-def sources(conf: VariantConf) -> dict[str, tuple[str, ...]]:
-    """Return the source files that decide what a variant of this config is, by part of the code.
-
-    The code that reads given poses, degrades and tags views counts where the config uses it. A
-    scene has a fingerprint of its own.
-    """
-    files: dict[str, tuple[str, ...]] = {"core": CORE}
-    if conf.poses is not None:
-        files["poses"] = POSES
-    if (name := resolve_degradation(conf)) in DEGRADATIONS:
-        files["degradation"] = (f"mixture/degradations/{name}.py",)
-    if conf.tags in POLICIES:
-        files["tags"] = (f"mixture/tags/{conf.tags}.py",)
-    return files
+def all_code(scene: SceneConf, conf: VariantConf) -> dict[str, str]:
+    """Return `code`, and the digest of the code that provides the photographs of the scene."""
+    return {"scene": scenes.code_of(scene.kind), **code(conf)}
 
 
 def find(variants: Path, wanted_key: str) -> Variant | None:
@@ -215,7 +202,7 @@ def _make(scene: scenes.Scene, conf: VariantConf, wanted_key: str, variants: Pat
         folder.mkdir()
     try:
         made = mixing.mix_resolutions(scene, conf, work, frozen)
-        return freeze(made, wanted_key, frozen, variants, code(conf))
+        return freeze(made, wanted_key, frozen, variants, all_code(scene, conf))
     except SceneFailed as error:
         write_json(frozen / "report.json", error.report | {"reason": str(error)})
         frozen.rename(failed)

@@ -39,14 +39,14 @@ class View:
     """Intrinsics [3, 3], px; pixel centres are at +0.5."""
     viewmat: NDArray[np.float64]
     """World to camera [4, 4], in the world of SfM, OpenCV axes."""
-    rho: float
+    sampling_rate: float
     """The relative sampling rate, in (0, 1]: focal length (px) / median depth of the SfM points
     that the view observes, over the largest such ratio of the variant. Downsampling a view by
     `factor` divides it by `factor`."""
     mask: Path | None = None
     """An 8-bit grey PNG of the same size: 255 where a pixel is used, 0 elsewhere. None uses all.
     Below it the file has the photograph, or what a degradation made of its neighbours."""
-    need: float = 1.0
+    supersampling: float = 1.0
     """How many times as many px a side the view needs to show what it sees as finely as the finest
     training views (`xrgs.mixture.sampling_rate.needed_factors`): about 1 for an HR view and about
     `factor` for a degraded one. A digital zoom counts with the pixels that it resolves."""

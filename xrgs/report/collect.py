@@ -16,13 +16,13 @@ import pandas as pd
 
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.evaluation.metrics import METRICS, ON_REQUEST, VIEW_METRICS
-from xrgs.evaluation.scoring import PROTOCOL, stale_scores, without_refactorings
 from xrgs.runtime.progress import progress
 from xrgs.safeio.records import as_number, read_table
 from xrgs.safeio.sanitize import for_line
 from xrgs.store.cell_folder import CellState
 from xrgs.store.provenance import machine
 from xrgs.store.results import over_views
+from xrgs.store.scoring import PROTOCOL, stale_scores, without_refactorings
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence

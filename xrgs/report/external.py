@@ -18,7 +18,6 @@ from msgspec import Meta
 
 from xrgs.evaluation.files import score_file
 from xrgs.evaluation.metrics import VIEW_METRICS
-from xrgs.evaluation.scoring import scoring_code
 from xrgs.mixture import variant
 from xrgs.photos.images import ImageError
 from xrgs.report.collect import ReportError, Sweep
@@ -28,6 +27,7 @@ from xrgs.safeio.paths import user_path
 from xrgs.safeio.records import read_struct
 from xrgs.safeio.sanitize import for_file_name
 from xrgs.store.results import over_views
+from xrgs.store.scoring import scoring_code
 
 if TYPE_CHECKING:
     from collections.abc import Hashable, Mapping, Sequence

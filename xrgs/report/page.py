@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from xrgs.evaluation.metrics import METRICS
-from xrgs.evaluation.scoring import PROTOCOL
 from xrgs.mixture.paths import TO_TRY
 from xrgs.report import curves, work
 from xrgs.report.collect import CELL_KEYS, RECORD_KEYS, ReportError, Sweep, read_cells
@@ -28,6 +27,7 @@ from xrgs.runtime.text import TextTable, to_text
 from xrgs.safeio.atomic import write_json, write_text
 from xrgs.safeio.sanitize import counted, for_csv, for_file_name, for_line, for_markdown
 from xrgs.store.provenance import MACHINE_KEYS, without_threads
+from xrgs.store.scoring import PROTOCOL
 from xrgs.store.store import BASELINE, Store
 
 if TYPE_CHECKING:

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, Self, cast
 import msgspec
 
 from xrgs.evaluation import protocol
-from xrgs.evaluation.scoring import scoring_code
 from xrgs.formats.ply import save_ply
 from xrgs.runtime import progress
 from xrgs.runtime.machine import peak_rss, set_torch_threads
@@ -26,6 +25,7 @@ from xrgs.safeio.sanitize import for_terminal
 from xrgs.splat.backend import resolve_backend
 from xrgs.store import provenance
 from xrgs.store.schema import Summary
+from xrgs.store.scoring import scoring_code
 from xrgs.training import dataset
 from xrgs.training.checkpoint import Checkpoint, CheckpointError
 from xrgs.training.count_matching import train_cell

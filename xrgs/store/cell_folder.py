@@ -211,7 +211,7 @@ class CellFolder:
 
         Args:
             views: Names of the scored views, in the order of `scores.csv`.
-            scored_by: Digests of the code that scored, see `xrgs.evaluation.scoring`.
+            scored_by: Digests of the code that scored, see `xrgs.store.scoring`.
         """
         sync_tree(self.path)
         files = {

@@ -3,10 +3,10 @@
 1. Words don't count: comments, docstrings and blank lines of the code change no id.
 2. What is off is absent: a component that is off, its settings and its module are not in the
    identity, nor is any key at its `off` value (`xrgs.config.off`).
-3. The module of a component counts where the component is on, and so does the code of a dense
-   start. The core counts always, and the native kernels count where the native backend trains.
+3. The code is every file of `splat/`, `training/` and `csrc/`. Files of a component, a strategy, a
+   backend or the dense start count where it is on, and all others always.
 4. Scores are apart: metrics and the evaluation protocol have digests of their own
-   (`xrgs.evaluation.scoring`), and `xrgs-store rescore` makes scores anew.
+   (`xrgs.store.scoring`), and `xrgs-store rescore` makes scores anew.
 5. A refactoring that changes no number keeps its cells: `xrgs-store prove` trains a sample of cells
    again, and declares the digests of the old and the new code equal where all bits are.
 6. Any other change of the hashed code makes new ids.
@@ -27,61 +27,37 @@ import msgspec
 
 from xrgs import plugins
 from xrgs.config import identity_values
-from xrgs.registry import modules_of, order_of
-from xrgs.safeio.code import code_digest
+from xrgs.registry import BUILT_IN, file_of, order_of
+from xrgs.safeio.code import CodeFolders, code_digest
 from xrgs.safeio.hashing import digest
-from xrgs.safeio.refactorings import canonical
+from xrgs.safeio.refactorings import ABSENT, canonical
 from xrgs.splat.backend import arithmetic, check_raster, resolve_backend
+from xrgs.splat.settings import STRATEGIES
 from xrgs.store.schema import Identity
 
 if TYPE_CHECKING:
     from xrgs.config import Conf
 
-#: Source files whose change can change a trained number, whatever components are on.
-CORE = (
-    "training/dataset.py",
-    "safeio/npz.py",
-    "splat/attribution.py",
-    "splat/backend.py",
-    "splat/bicubic.py",
-    "splat/cameras.py",
-    "splat/gaussians.py",
-    "splat/loss.py",
-    "splat/native",
-    "splat/normalize.py",
-    "splat/optimizer.py",
-    "splat/quaternions.py",
-    "splat/rendering.py",
-    "splat/resample.py",
-    "splat/rounding.py",
-    "splat/settings.py",
-    "splat/sh.py",
-    "splat/ssim.py",
-    "splat/strategy/__init__.py",
-    "splat/strategy/base.py",
-    "splat/strategy/default.py",
-    "splat/strategy/mcmc.py",
-    "splat/strategy/ops.py",
-    "splat/strategy/refinement.py",
-    "splat/torch",
-    "training/checkpoint.py",
-    "training/components/__init__.py",
-    "training/components/base.py",
-    "training/components/combined.py",
-    "training/count_matching.py",
-    "training/loop.py",
-    "training/memory.py",
-    "training/recorder.py",
-    "training/rendering.py",
-    "training/sampler.py",
-    "training/seeding.py",
-    "training/work.py",
+#: The code that trains. Every file counts always, but those of the backends, of the dense start, of
+#: the strategies and of the components: these count where they are on.
+CODE = CodeFolders(
+    folders=("splat", "training"),
+    whole_parts=("splat/gsplat", "splat/native", "splat/torch", "training/dense"),
+    folders_of_parts=("splat/strategy", "training/components"),
+    parts=frozenset(
+        {f"splat/strategy/{name}.py" for name in STRATEGIES}
+        | {file for key in BUILT_IN if (file := file_of(key))}
+    ),
 )
-#: Files that count on one backend only. Of the native one these are the C++ sources, and not the
-#: compiled module: two builds of the same sources differ in their bytes and give the same numbers.
-BACKEND_CODE = {"native": ("csrc",), "gsplat": ("splat/gsplat",)}
+#: The parts of each backend. Of the kernels these are the C++ sources, and not the compiled module:
+#: two builds of the same sources differ in their bytes and give the same numbers.
+_BACKENDS = {
+    "native": {"native": ("splat/native", "csrc")},
+    "torch": {"torch": ("splat/torch",)},
+    "gsplat": {"gsplat": ("splat/gsplat",), "torch": ("splat/torch",)},
+}
 #: The code that places the first Gaussians, by the values of `splat.init`; that of others is core.
-START_CODE = {"dense": ("training/dense",)}
+_STARTS = {"dense": ("training/dense",)}
 
 
 def cell_identity(conf: Conf, variant_id: str) -> Identity:
@@ -106,7 +82,11 @@ def cell_identity(conf: Conf, variant_id: str) -> Identity:
         components=components,
         arithmetic=arithmetic(backend),
         code=training_code(
-            backend, tuple(components), tuple(sorted(conf.components.plugins)), conf.splat.init
+            backend,
+            tuple(components),
+            tuple(sorted(conf.components.plugins)),
+            conf.splat.init,
+            conf.splat.strategy,
         ),
     )
 
@@ -122,6 +102,7 @@ def training_code(
     components: tuple[str, ...] = (),
     plugin_names: tuple[str, ...] = (),
     init: str = "sfm",
+    strategy: str = "default",
 ) -> dict[str, str]:
     """Return the digest of each part of the code that trains a cell; files are read once.
 
@@ -130,11 +111,12 @@ def training_code(
         components: Keys of the components that are on.
         plugin_names: Names of components of other packages, sorted.
         init: `splat.init` of the config.
+        strategy: `splat.strategy` of the config.
 
     Raises:
         XrgsError: A plugin is not installed, or has no source file.
     """
-    return code_now(backend, components, plugin_names, init)
+    return code_now(backend, components, plugin_names, init, strategy)
 
 
 def code_now(
@@ -142,23 +124,26 @@ def code_now(
     components: tuple[str, ...] = (),
     plugin_names: tuple[str, ...] = (),
     init: str = "sfm",
+    strategy: str = "default",
 ) -> dict[str, str]:
     """Return `training_code` of the files as they are now, edited meanwhile or not."""
-    files = _files(backend, components, init)
+    files = _files(backend, components, init, strategy)
     code = {part: canonical(part, code_digest(*names)) for part, names in files.items()}
     if order := order_of(components):  # of the components' hooks
         code["order"] = order
-    return code | {f"plugins/{name}": plugins.code_digest(name) for name in plugin_names}
+    code |= {f"plugins/{name}": plugins.code_digest(name) for name in plugin_names}
+    return {part: digest for part, digest in code.items() if digest != ABSENT}
 
 
-def _files(backend: str, components: tuple[str, ...], init: str) -> dict[str, tuple[str, ...]]:
+def _files(
+    backend: str, components: tuple[str, ...], init: str, strategy: str
+) -> dict[str, tuple[str, ...]]:
     """Return the source files of each part of the code, relative to the package."""
-    files: dict[str, tuple[str, ...]] = {"core": CORE}
-    if backend in BACKEND_CODE:
-        files[backend] = BACKEND_CODE[backend]
-    if init in START_CODE:
-        files[init] = START_CODE[init]
-    return files | {key: modules_of(key) for key in components if modules_of(key)}
+    files = {"core": CODE.core(), **_BACKENDS[backend]}
+    if init in _STARTS:
+        files[init] = _STARTS[init]
+    files[f"strategy/{strategy}"] = CODE.part(f"splat/strategy/{strategy}.py")
+    return files | {key: CODE.part(file) for key in components if (file := file_of(key))}
 
 
 def changed_code(identity: Identity, *, cached: bool = False) -> list[str]:
@@ -183,4 +168,6 @@ def current_code(identity: Identity, *, cached: bool = False) -> dict[str, str]:
     names = tuple(sorted(identity.components.get("plugins", {})))
     code = training_code if cached else code_now
     init = str(identity.splat.get("init", "sfm"))
-    return code(str(identity.splat["backend"]), tuple(identity.components), names, init)
+    strategy = str(identity.splat.get("strategy", "default"))
+    backend = str(identity.splat["backend"])
+    return code(backend, tuple(identity.components), names, init, strategy)

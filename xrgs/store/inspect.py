@@ -187,7 +187,7 @@ def views_table(frozen: Variant, report: SfmReport) -> TextTable:
     Photographs that SfM did not register are in the table too, by the names in the report.
     """
     rows = [
-        (v.name, v.split, v.tag, f"{v.width} x {v.height}", f"{v.rho:.3f}", "yes")
+        (v.name, v.split, v.tag, f"{v.width} x {v.height}", f"{v.sampling_rate:.3f}", "yes")
         for v in frozen.views
         if v.split != "original"
     ]
@@ -227,7 +227,7 @@ class Mixture(NamedTuple):
 
 def mixture(views: Iterable[View | ViewEntry]) -> Mixture:
     """Count the coarse training views among the views of a variant."""
-    needs = [view.need for view in views if view.split == "train"]
+    needs = [view.supersampling for view in views if view.split == "train"]
     # `supersampled`, and so the recipes, render a view larger by its need, rounded.
     return Mixture(sum(round(need) > 1 for need in needs), len(needs))
 

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 from xrgs.errors import StoreError, XrgsError
 from xrgs.evaluation.metrics import ON_REQUEST, also_scored
-from xrgs.evaluation.scoring import on_request, scoring_code, stale_scores
 from xrgs.runtime import lease
 from xrgs.runtime.progress import progress
 from xrgs.safeio.atomic import write_text
@@ -15,6 +14,7 @@ from xrgs.safeio.hashing import file_digest
 from xrgs.safeio.records import table_text
 from xrgs.safeio.sanitize import counted, for_line
 from xrgs.store.identity import changed_code
+from xrgs.store.scoring import on_request, scoring_code, stale_scores
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -310,7 +310,9 @@ def _render_sizes(views: Sequence[ViewEntry], conf: Conf, step: float) -> Iterat
     most = larger.late_factor if step >= larger.late_from else larger.factor
     blurred = conf.components.formation.widths != "none"
     zoom = conf.variant.factor if resolve_degradation(conf.variant) == "digital_zoom" else 1
-    sizes = Counter((v.width * v.height, min(max(1, round(v.need)), most), v.tag) for v in views)
+    sizes = Counter(
+        (v.width * v.height, min(max(1, round(v.supersampling)), most), v.tag) for v in views
+    )
     for (pixels, factor, tag), count in sizes.items():
         scale = factor / reduced if tag == "HR" else float(factor)
         if tag == "LR" and (factor > 1 or blurred):  # at the size of the pixels that it resolves

@@ -16,13 +16,12 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from xrgs.errors import StoreError, XrgsError
-from xrgs.evaluation import scoring
 from xrgs.mixture import saved_variant, variant
 from xrgs.runtime.progress import log_line
 from xrgs.safeio import refactorings
-from xrgs.safeio.refactorings import canonical
+from xrgs.safeio.refactorings import ABSENT, canonical
 from xrgs.safeio.sanitize import counted
-from xrgs.store import identity
+from xrgs.store import identity, scoring
 from xrgs.store.store import Store
 from xrgs.sweep import build_variants
 from xrgs.sweep.rerun import rerun
@@ -111,9 +110,10 @@ def _changes(cell: CellFolder) -> list[Change]:
     now, changed = identity.current_code(trained), identity.changed_code(trained)
     if any(part.startswith("plugins/") for part in changed):
         raise XrgsError(f"{cell.id}: a plugin has changed, which is no part of this package")
-    if new := [part for part in changed if part not in trained.code or part not in now]:
-        raise XrgsError(f"{cell.id}: {', '.join(new)} is not in both versions of the code")
-    return [(part, trained.code[part], now[part]) for part in changed] + _changes_of_scores(cell)
+    if gone := [part for part in changed if part not in now]:
+        raise XrgsError(f"{cell.id}: {', '.join(gone)} is not in the installed code")
+    changes = [(part, trained.code.get(part, ABSENT), now[part]) for part in changed]
+    return changes + _changes_of_scores(cell)
 
 
 def _changes_of_scores(cell: CellFolder) -> list[Change]:
@@ -133,7 +133,8 @@ def _changes_of_variant(store: Store, cell: CellFolder) -> list[Change]:
         built = saved_variant.read_manifest(store.variants / cell.identity().variant).code
     except StoreError:
         return []
-    now = variant.code(cell.config().variant)
+    conf = cell.config()
+    now = variant.all_code(conf.scene, conf.variant)
     changes = [(f"variant/{part}", built[part], now[part]) for part in now if part in built]
     return [(part, old, new) for part, old, new in changes if canonical(part, old) != new]
 

@@ -35,11 +35,11 @@ class LoadedView:
     camera: Camera
     pixels: torch.Tensor
     """[H, W, 3], uint8 as the file has them; floats are taken as they are, in 0..1."""
-    rho: float = 1.0
+    sampling_rate: float = 1.0
     """The relative sampling rate in (0, 1], see `xrgs.mixture.views.View`."""
     mask: torch.Tensor | None = None
     """[H, W] bool, True for a pixel that is used; None uses all."""
-    need: float = 1.0
+    supersampling: float = 1.0
     """How many times as many px a side the view needs, see `xrgs.mixture.views.View`."""
 
     def to(self, device: str) -> LoadedView:
@@ -203,5 +203,11 @@ def _load_view(view: View, viewmat: NDArray[np.float64], *, hide: bool) -> Loade
         pixels = masks.filled(pixels, mask)
     used = None if mask is None else torch.from_numpy(mask)
     return LoadedView(
-        view.name, view.tag, camera, torch.from_numpy(pixels), view.rho, used, view.need
+        view.name,
+        view.tag,
+        camera,
+        torch.from_numpy(pixels),
+        view.sampling_rate,
+        used,
+        view.supersampling,
     )

@@ -27,7 +27,7 @@ def make_view(tag: str, image: Tensor) -> LoadedView:
     height, width = image.shape[:2]
     K = torch.tensor([[1.2 * width, 0, width / 2], [0, 1.2 * width, height / 2], [0, 0, 1]])
     camera = Camera(torch.eye(4), K, width, height)
-    return LoadedView(tag.lower(), tag, camera, image, need=FACTOR if tag == "LR" else 1)
+    return LoadedView(tag.lower(), tag, camera, image, supersampling=FACTOR if tag == "LR" else 1)
 
 
 def renderer_of(parts: Components) -> StepRenderer:

@@ -32,7 +32,7 @@ NO_GAUSSIANS = Gaussians(*[torch.empty(0)] * 6)
 def view(name: str, tag: str) -> LoadedView:
     """A black view of 60 x 75 px, or of 12 x 15."""
     size, rho = ((60, 75), 1.0) if tag == "HR" else ((12, 15), 0.2)
-    return replace(make_view(tag, torch.zeros(*size, 3).double()), name=name, rho=rho)
+    return replace(make_view(tag, torch.zeros(*size, 3).double()), name=name, sampling_rate=rho)
 
 
 VIEWS = {

@@ -31,7 +31,7 @@ Scores = Callable[..., Tensor]
 @pytest.fixture
 def fine(views: dict[str, LoadedView]) -> list[LoadedView]:
     """The HR view, and the LR view with its sampling rate."""
-    return [views["HR"], replace(views["LR"], rho=0.2)]
+    return [views["HR"], replace(views["LR"], sampling_rate=0.2)]
 
 
 def ready(parts: Components) -> Components:

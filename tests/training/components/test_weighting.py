@@ -169,7 +169,7 @@ def test_the_weight_is_a_power_of_the_rate_whatever_the_tag(
 ) -> None:
     off.continuous_weighting.gamma = 0.86
     off.loss_weighting.lr_weight = 0.5  # not read
-    view = dataclasses.replace(VIEW, rho=rho, tag=tag)
+    view = dataclasses.replace(VIEW, sampling_rate=rho, tag=tag)
     assert weight(build(off, view), view) == pytest.approx(expected, rel=1e-3)
 
 

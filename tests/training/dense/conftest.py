@@ -86,7 +86,11 @@ def true_scene(count: int, width: int) -> TrueScene:
         camera = full.resized(small.shape[1], small.shape[0])
         pixels = (small * 255).round().to(torch.uint8)
         tag = "HR" if shrink == 1 else "LR"
-        views.append(LoadedView(f"v{number}", tag, camera, pixels, rho=1 / shrink, need=shrink))
+        views.append(
+            LoadedView(
+                f"v{number}", tag, camera, pixels, sampling_rate=1 / shrink, supersampling=shrink
+            )
+        )
     points_of_scene = torch.from_numpy(world.points).float()
     data = Dataset(
         tuple(views), tuple(views[:1]), points_of_scene, colors, world.scene_scale, FACTOR

@@ -13,28 +13,31 @@ from typing import TYPE_CHECKING
 
 from xrgs.errors import XrgsError
 from xrgs.photos import masks
-from xrgs.photos.scenes.folder import FolderScene, list_photographs
-from xrgs.photos.scenes.motorcycle import Motorcycle
-from xrgs.photos.scenes.procedural import ProceduralScene
+from xrgs.photos.scenes.folder import list_photographs
+from xrgs.photos.scenes.kinds import KINDS, MADE, code_of
 from xrgs.photos.scenes.rendered import verify
-from xrgs.photos.scenes.scene import Scene, SceneKind, files_digest, label
-from xrgs.photos.scenes.video import VideoScene
+from xrgs.photos.scenes.scene import Scene, files_digest, label
 from xrgs.safeio.paths import user_path
+from xrgs.safeio.refactorings import ABSENT
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from xrgs.config import SceneConf
+    from xrgs.photos.scenes.scene import SceneKind
 
-__all__ = ["KINDS", "Scene", "check_labels", "fingerprint", "label", "names", "resolve", "verify"]
+__all__ = [
+    "KINDS",
+    "Scene",
+    "check_labels",
+    "code_of",
+    "fingerprint",
+    "label",
+    "names",
+    "resolve",
+    "verify",
+]
 
-#: The kinds of scenes by `scene.kind`.
-KINDS: dict[str, SceneKind] = {
-    "procedural": ProceduralScene(),
-    "motorcycle": Motorcycle(),
-    "folder": FolderScene(),
-    "video": VideoScene(),
-}
 #: Kinds whose photographs are in this package, or are rendered by it.
 _EMBEDDED = ("procedural", "motorcycle")
 #: The values of `scene.alpha`; the first changes no fingerprint.
@@ -66,7 +69,9 @@ def names(conf: SceneConf, long_side: int = 0) -> list[str]:
 
 
 def fingerprint(conf: SceneConf, long_side: int = 0) -> str:
-    """Hash the photographs of a scene, without rendering or decoding them: 16 hexadecimal digits.
+    """Hash the photographs of a scene and the code that provides them: 16 hexadecimal digits.
+
+    Nothing is rendered or decoded for it.
 
     Args:
         conf: The scene's config.
@@ -82,6 +87,8 @@ def fingerprint(conf: SceneConf, long_side: int = 0) -> str:
     if not all(0 <= value <= 1 for value in conf.background):
         raise XrgsError(f"scene.background={list(conf.background)}: values must be 0 to 1")
     content = f"{conf.kind}\0{_kind(conf).digest(conf, long_side)}"
+    if conf.kind not in MADE and (code := code_of(conf.kind)) != ABSENT:
+        content += f"\0{code}"
     if (conf.alpha, *conf.background) != (ALPHA[0], 0, 0, 0):
         content += f"\0{conf.alpha}\0{list(conf.background)}"
     if conf.masks is not None:

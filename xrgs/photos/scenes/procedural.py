@@ -7,16 +7,17 @@ in `still_life`, which needs torch; nothing here does.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from xrgs.photos.scenes import rendered
 from xrgs.photos.scenes.scene import Scene, bundled_photograph, check_views, label
-from xrgs.safeio.code import code_digest
 from xrgs.safeio.hashing import digest, file_digest
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -49,17 +50,12 @@ TEXTURES: dict[str, tuple[str, tuple[float, float, float]]] = {
 }
 
 
-#: The source files that decide the pixels of the views, relative to the package.
-_SOURCES = (
-    "photos/images.py",
-    "photos/scenes/procedural.py",
-    "photos/scenes/raycast.py",
-    "photos/scenes/still_life.py",
-)
-
-
+@dataclass(frozen=True)
 class ProceduralScene:
     """The embedded scene: its views are rendered once, and their exact cameras are known."""
+
+    code: Callable[[str], str]
+    """The digest of the code of a kind of scenes."""
 
     def names(self, conf: SceneConf, long_side: int) -> list[str]:  # noqa: ARG002
         """Return the names of the views."""
@@ -70,7 +66,7 @@ class ProceduralScene:
         """Hash the source code, the textures, and the size and number of the views."""
         check_views(conf)
         textures = [file_digest(bundled_photograph(name)) for name, _ in TEXTURES.values()]
-        return digest([camera_size(long_side), conf.views, textures, code_digest(*_SOURCES)])
+        return digest([camera_size(long_side), conf.views, textures, self.code("procedural")])
 
     def resolve(self, conf: SceneConf, long_side: int, home: Path) -> Scene:
         """Render the views where they are not there."""

@@ -65,8 +65,9 @@ class Scene:
 class SceneKind(Protocol):
     """A source of photographs.
 
-    A new kind is one module of this folder and one line in `xrgs.photos.scenes.KINDS`. The key of
-    a variant has what `digest` returns, and none of the code of a kind.
+    A new kind is one module of this folder, named after the value of `scene.kind`, and one line in
+    `xrgs.photos.scenes.kinds.KINDS`. The key of a variant has what `digest` returns and the code of
+    the kind, and not the code of the others.
     """
 
     def names(self, conf: SceneConf, long_side: int) -> list[str]:
@@ -83,7 +84,7 @@ class SceneKind(Protocol):
     def digest(self, conf: SceneConf, long_side: int) -> str:
         """Hash all that decides the photographs, without decoding or rendering them.
 
-        A kind that renders or extracts its photographs hashes the source code that does so, too.
+        A kind of `MADE` hashes its code, too.
         """
 
     def resolve(self, conf: SceneConf, long_side: int, home: Path) -> Scene:

@@ -27,14 +27,13 @@ from xrgs.photos.scenes.deinterlace import deinterlaced
 from xrgs.photos.scenes.panoramas import is_of_all_directions
 from xrgs.photos.scenes.scene import Scene, check_views, label
 from xrgs.runtime.progress import ProgressBar
-from xrgs.safeio.code import code_digest
 from xrgs.safeio.files import is_transient
 from xrgs.safeio.hashing import digest, file_digest
 from xrgs.safeio.paths import user_path
 from xrgs.safeio.sanitize import for_line
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from av.container import InputContainer
     from av.video.frame import VideoFrame
@@ -49,12 +48,6 @@ _log = logging.getLogger(__name__)
 _SHARPNESS_SIDE = 640
 #: The containers that are read, by FFmpeg's names. Others, such as playlists, lead to other files.
 _CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg"
-
-#: The source files that decide the frames, relative to the package.
-_SOURCES = (
-    *("photos/colour.py", "photos/images.py"),
-    *("photos/scenes/deinterlace.py", "photos/scenes/video.py"),
-)
 #: H.273's number of a matrix that is not named, and the rows from which on players then take that
 #: of BT.709; for smaller frames they take that of BT.601.
 _UNKNOWN_MATRIX, _HD_ROWS = 2, 720
@@ -71,8 +64,12 @@ class _Frame:
     """Width and height with square pixels, before it is turned, px."""
 
 
+@dataclass(frozen=True)
 class VideoScene:
     """The sharpest frames of a video, which are extracted once."""
+
+    code: Callable[[str], str]
+    """The digest of the code of a kind of scenes."""
 
     def names(self, conf: SceneConf, long_side: int) -> list[str]:  # noqa: ARG002
         """Return the names of the frames: `frame_0000`, `frame_0001`, ..."""
@@ -95,7 +92,7 @@ class VideoScene:
             raise kind(f"scene.path={file}: {error.strerror}") from error
         if find_spec("av") is None:
             raise XrgsError(f"scene.path={file}: a video needs PyAV: pip install 'xrgs[video]'")
-        return digest([content, conf.views, code_digest(*_SOURCES)])
+        return digest([content, conf.views, self.code("video")])
 
     def resolve(self, conf: SceneConf, long_side: int, home: Path) -> Scene:
         """Extract the frames where they are not there."""

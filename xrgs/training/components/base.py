@@ -61,11 +61,11 @@ class TrainingView(Protocol):
         """The resolution class of the view, `HR` or `LR`."""
 
     @property
-    def rho(self) -> float:
+    def sampling_rate(self) -> float:
         """The sampling rate of the view over the highest rate of all views, in (0, 1]."""
 
     @property
-    def need(self) -> float:
+    def supersampling(self) -> float:
         """How many times as many px a side the view needs to be as fine as the finest views."""
 
     @property

@@ -93,7 +93,7 @@ class Supersampled(Component):
         self.zoom = zoom if degradation == "digital_zoom" else 1
         low = [view for view in views if view.tag == "LR"]
         self.blur = BlurWidths(blur, low) if blur.widths != "none" else None
-        self._log_factors([view.need for view in views])
+        self._log_factors([view.supersampling for view in views])
 
     @classmethod
     def from_settings(cls, settings: SupersampledConf, setup: TrainingSetup) -> Self | None:
@@ -164,7 +164,7 @@ class Supersampled(Component):
         """Return k at a step on a view."""
         late = step.nominal >= self.settings.late_from
         settings = self.settings
-        return _clamped(step.view.need, settings.late_factor if late else settings.factor)
+        return _clamped(step.view.supersampling, settings.late_factor if late else settings.factor)
 
     def _is_blurred(self, step: Step) -> bool:
         return self.blur is not None and step.view.tag == "LR"

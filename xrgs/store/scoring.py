@@ -10,7 +10,7 @@ from functools import cache
 from typing import TYPE_CHECKING
 
 from xrgs.evaluation.metrics import METRICS, ON_REQUEST, VIEW_METRICS
-from xrgs.safeio.code import code_digest
+from xrgs.safeio.code import CodeFolders, code_digest
 from xrgs.safeio.refactorings import canonical
 
 if TYPE_CHECKING:
@@ -18,6 +18,21 @@ if TYPE_CHECKING:
 
 #: The key of the protocol among the digests of scores.
 PROTOCOL = "protocol"
+#: The file of each score's function, relative to the package.
+_FILES = {
+    metric.name: f"{metric.score.__module__.removeprefix('xrgs.').replace('.', '/')}.py"
+    for metric in METRICS
+    if metric.score is not None
+}
+#: The code that scores. A metric's file counts for its score, with what it imports, and all else
+#: for the protocol.
+_CODE = CodeFolders(
+    folders=("evaluation",),
+    whole_parts=(),
+    folders_of_parts=("evaluation/lpips", "evaluation/metrics"),
+    parts=frozenset(_FILES.values()),
+    registries=frozenset({"evaluation/metrics/__init__.py"}),
+)
 
 
 @cache
@@ -28,8 +43,8 @@ def scoring_code(also: frozenset[str] = frozenset()) -> dict[str, str]:
         also: Scores of `ON_REQUEST` to include.
     """
     wanted = {*VIEW_METRICS, *also}
-    scores = {m.name: code_digest(*m.sources) for m in METRICS if m.name in wanted}
-    return without_refactorings({PROTOCOL: code_digest("evaluation/protocol.py"), **scores})
+    scores = {n: code_digest(*_CODE.part(file)) for n, file in _FILES.items() if n in wanted}
+    return without_refactorings({PROTOCOL: code_digest(*_CODE.core()), **scores})
 
 
 def without_refactorings(codes: Mapping[str, str]) -> dict[str, str]:
