@@ -13,7 +13,7 @@ import pytest
 
 from tests.photos.scene_confs import scene_conf
 from xrgs.config import VariantConf
-from xrgs.mixture import degradations, tags, variant
+from xrgs.mixture import degradations, poses, tags, variant
 from xrgs.photos import scenes
 from xrgs.safeio import code
 
@@ -66,7 +66,7 @@ def test_every_file_of_photos_and_mixture_counts_always_or_with_a_part(
     package: Path, configured: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A line of code at the end of each file in turn; registries and downloads don't count."""
-    monkeypatch.setattr(variant.poses, "fingerprint", lambda _: "poses")
+    monkeypatch.setattr(poses, "fingerprint", lambda _: "poses")
 
     def codes() -> list[dict[str, str]]:
         confs = [configured(**change, poses="anything") for change in CHANGES.values()]

@@ -179,7 +179,7 @@ def build(scene: SceneConf, conf: VariantConf, variants: Path, cache: Path) -> V
         for corrupt in _of_key(variants, wanted_key):
             _log.warning("%s: renamed to %s", corrupt, checksums.set_aside(corrupt).name)
         resolved = scenes.resolve(scene, cache, conf.long_side)
-        return _make(resolved, conf, wanted_key, variants)
+        return _make(resolved, conf, wanted_key, variants, all_code(scene, conf))
 
 
 def _modified_ns(file: Path) -> int | None:
@@ -189,7 +189,13 @@ def _modified_ns(file: Path) -> int | None:
         return None
 
 
-def _make(scene: scenes.Scene, conf: VariantConf, wanted_key: str, variants: Path) -> Variant:
+def _make(
+    scene: scenes.Scene,
+    conf: VariantConf,
+    wanted_key: str,
+    variants: Path,
+    made_by: dict[str, str],
+) -> Variant:
     """Make and freeze a variant, after what a killed process left of it is removed."""
     from xrgs.mixture import mixing
 
@@ -202,7 +208,7 @@ def _make(scene: scenes.Scene, conf: VariantConf, wanted_key: str, variants: Pat
         folder.mkdir()
     try:
         made = mixing.mix_resolutions(scene, conf, work, frozen)
-        return freeze(made, wanted_key, frozen, variants, all_code(scene, conf))
+        return freeze(made, wanted_key, frozen, variants, made_by)
     except SceneFailed as error:
         write_json(frozen / "report.json", error.report | {"reason": str(error)})
         frozen.rename(failed)

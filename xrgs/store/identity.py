@@ -51,7 +51,7 @@ CODE = CodeFolders(
 )
 #: The parts of each backend. Of the kernels these are the C++ sources, and not the compiled module:
 #: two builds of the same sources differ in their bytes and give the same numbers.
-_BACKENDS = {
+_BACKENDS: dict[str, dict[str, tuple[str, ...]]] = {
     "native": {"native": ("splat/native", "csrc")},
     "torch": {"torch": ("splat/torch",)},
     "gsplat": {"gsplat": ("splat/gsplat",), "torch": ("splat/torch",)},
@@ -139,7 +139,7 @@ def _files(
     backend: str, components: tuple[str, ...], init: str, strategy: str
 ) -> dict[str, tuple[str, ...]]:
     """Return the source files of each part of the code, relative to the package."""
-    files = {"core": CODE.core(), **_BACKENDS[backend]}
+    files: dict[str, tuple[str, ...]] = {"core": CODE.core(), **_BACKENDS[backend]}
     if init in _STARTS:
         files[init] = _STARTS[init]
     files[f"strategy/{strategy}"] = CODE.part(f"splat/strategy/{strategy}.py")
