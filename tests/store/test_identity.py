@@ -409,6 +409,14 @@ def test_a_declared_refactoring_keeps_all_ids(package: Path, confs: dict[str, Co
     assert identity.changed_code(early) == []
 
 
+def test_a_part_that_was_split_off_is_absent_until_it_changes(package: Path) -> None:
+    """Cells of before the split don't name it."""
+    assert "strategy/default" not in identity.code_now("native")
+    file = package / "splat/strategy/default.py"
+    file.write_text(f"{file.read_text()}\nMORE = 1\n")
+    assert "strategy/default" in identity.code_now("native")
+
+
 # 6. Of the machine the arithmetic counts.
 
 

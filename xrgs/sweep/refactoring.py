@@ -85,7 +85,8 @@ def prove(store: Store, cells: Sequence[CellFolder], sample: int = 2) -> Proof:
             " it was built with other code (variants of earlier versions don't say)"
         )
     parts = [part for part, _, _ in changes]
-    if several := {part for part in parts if parts.count(part) > 1}:
+    installed = [(part, new) for part, _, new in changes]
+    if several := {part for part, new in installed if installed.count((part, new)) > 1}:
         raise XrgsError(
             f"cells were trained with several versions of {', '.join(sorted(several))}: name cells"
             " of one version"
@@ -101,7 +102,7 @@ def prove(store: Store, cells: Sequence[CellFolder], sample: int = 2) -> Proof:
     refactorings.declare(changes)
     identity.training_code.cache_clear()
     scoring.scoring_code.cache_clear()
-    return Proof(tuple(trained), tuple(built), tuple(parts))
+    return Proof(tuple(trained), tuple(built), tuple(dict.fromkeys(parts)))
 
 
 def _changes(cell: CellFolder) -> list[Change]:
