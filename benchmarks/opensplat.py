@@ -16,17 +16,17 @@ from pathlib import Path
 from statistics import fmean
 from typing import IO, TYPE_CHECKING
 
-from xrgs.capture import images
-from xrgs.capture.colmap import PinholeImage, write_model
 from xrgs.evaluation.protocol import score_views
+from xrgs.mixture.colmap import PinholeImage, write_model
+from xrgs.photos import images
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-    from xrgs.capture.dataset import Dataset, LoadedView
     from xrgs.config import SplatConf
     from xrgs.splat.cameras import Camera
     from xrgs.splat.gaussians import Gaussians
+    from xrgs.training.dataset import Dataset, LoadedView
 
 #: Where its renderer differs from ours: the colour behind the last Gaussian, and the cap of alpha.
 _BACKGROUND, _ALPHA_MAX = (0.6130, 0.0101, 0.3984), 0.999

@@ -33,16 +33,16 @@ import race_table
 from race_table import Run
 
 import xrgs
-from xrgs.capture import dataset
-from xrgs.experiment.provenance import this_processor
-from xrgs.experiment.results import cell_metrics
-from xrgs.experiment.store import BASELINE, Store
+from xrgs.formats.ply import load_ply
 from xrgs.report.external import FIGURES
 from xrgs.safeio.atomic import write_json, write_text
 from xrgs.safeio.records import table_text
 from xrgs.splat.backend import resolve_backend
-from xrgs.splat.ply import load_ply
 from xrgs.splat.settings import NOMINAL_STEPS
+from xrgs.store.provenance import this_processor
+from xrgs.store.results import cell_metrics
+from xrgs.store.store import BASELINE, Store
+from xrgs.training import dataset
 
 CORES = 2
 _SEVEN = (

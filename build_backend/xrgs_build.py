@@ -111,7 +111,7 @@ def _commit_file() -> Iterator[None]:
 
     Nothing is written into a checkout that is read-only: the package then has no commit.
     """
-    source = _ROOT / "xrgs" / "experiment" / "commit.py"
+    source = _ROOT / "xrgs" / "store" / "commit.py"
     commit = runpy.run_path(str(source))  # the package itself needs what a build does not have
     found = commit["of_checkout"](_ROOT)
     if found is None:

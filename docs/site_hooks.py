@@ -29,7 +29,7 @@ from mkdocs.structure.files import File
 
 from xrgs import config as xrgs_config
 from xrgs.cli import key_help
-from xrgs.training.registry import BUILT_IN
+from xrgs.registry import BUILT_IN
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -44,7 +44,7 @@ DOCS = ROOT / "docs"
 PAGES = {
     "README.md": "index.md",
     "conf/config.yaml": "conf/config.md",
-    "xrgs/training/registry.py": "components.md",
+    "xrgs/registry.py": "components.md",
 }
 #: Files that are shown as a page, with the language that they are highlighted as.
 SOURCES = {".py": "python", ".yaml": "yaml", ".bib": "bibtex", ".cff": "yaml", ".toml": "toml"}

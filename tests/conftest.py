@@ -29,15 +29,17 @@ from hypothesis import HealthCheck, settings
 
 from tests import forks, pdflatex
 from xrgs import composing, config
-from xrgs.capture import variant
-from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.evaluation.lpips import weights
-from xrgs.experiment.store import Store
+from xrgs.mixture import variant
 from xrgs.splat.cameras import Camera
+from xrgs.store.store import Store
+from xrgs.training.dataset import Dataset, LoadedView
 
 # How long an example takes tells how busy the machine is, and fails no test.
 settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("untimed")
+
+pytest_plugins = ["tests.variant_fixtures"]
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -174,7 +176,7 @@ def data() -> Dataset:
         ramp = torch.linspace(0, 1, width).expand(height, width)
         image = torch.stack([ramp, ramp.flip(1), torch.full_like(ramp, 0.5)], dim=-1)
         camera, rho = _camera(width, height), width / 60
-        views.append(LoadedView(f"v{number}", tag, camera, image, rho, need=1 / rho))
+        views.append(LoadedView(f"v{number}", tag, camera, image, rho, supersampling=1 / rho))
     colors = torch.rand(60, 3, generator=generator)
     return Dataset(tuple(views), tuple(views[:1]), points, colors, scene_scale=1.0, factor=5)
 
@@ -388,7 +390,7 @@ class _Handler(BaseHTTPRequestHandler):
 @pytest.fixture
 def pauses(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """Let downloads try again at once; return the seconds that they would have waited."""
-    from xrgs.capture.download import http
+    from xrgs.photos.download import http
 
     waited: list[float] = []
     monkeypatch.setattr(http, "sleep", waited.append)

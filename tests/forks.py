@@ -31,8 +31,8 @@ WORKER = "xrgs.sweep.jobs.worker"
 #: What the commands and the children of a sweep import, some of it late.
 MODULES = (
     *(f"xrgs.cli.{name}" for name in ("bench", "render", "report", "status", "store", "sweep")),
-    *("xrgs.capture.sfm", "kornia.losses", "matplotlib.backends.backend_agg"),
-    *("xrgs.bench.run", "xrgs.experiment.cell", "xrgs.report", "xrgs.sweep.rerun"),
+    *("xrgs.mixture.sfm", "kornia.losses", "matplotlib.backends.backend_agg"),
+    *("xrgs.bench.run", "xrgs.store.cell", "xrgs.report", "xrgs.sweep.rerun"),
     *("xrgs.viewer.film", "xrgs.viewer.trained"),
 )
 

@@ -17,7 +17,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from xrgs.splat import backend, gsplat_api
+from xrgs.formats import gsplat_api
+from xrgs.splat import backend
 
 #: The setting that equals the constant of gsplat 1.5.3's kernels.
 ALPHA_MAX = "splat.raster.alpha_max=0.999"

@@ -16,15 +16,16 @@ import numpy as np
 from PIL import Image
 
 from tests.conftest import composed
-from xrgs.capture import frozen, sealed, variant
 from xrgs.config import Conf
-from xrgs.evaluation.scoring import scoring_code
-from xrgs.experiment import provenance
-from xrgs.experiment.attempts import begin_attempt, plan_cell
-from xrgs.experiment.identity import cell_id, cell_identity
-from xrgs.experiment.schema import Provenance, RecordedCell, Summary
-from xrgs.experiment.store import Store
+from xrgs.mixture import saved_variant, variant
+from xrgs.safeio import checksums
 from xrgs.safeio.atomic import write_json
+from xrgs.store import provenance
+from xrgs.store.attempts import begin_attempt, plan_cell
+from xrgs.store.identity import cell_id, cell_identity
+from xrgs.store.schema import Provenance, RecordedCell, Summary
+from xrgs.store.scoring import scoring_code
+from xrgs.store.store import Store
 
 LABELS = ("baseline", "consistency")
 SEEDS = (0, 1)
@@ -128,20 +129,24 @@ def _write_variant(variants: Path, conf: Conf) -> str:
         )
     rng = np.random.default_rng(0)
     points = rng.uniform((-0.5, -0.5, 2.5), (0.5, 0.5, 3.5), (50, 3))
-    np.savez(folder / frozen.POINTS, points=points, colors=rng.integers(0, 255, (50, 3), np.uint8))
+    np.savez(
+        folder / saved_variant.POINTS, points=points, colors=rng.integers(0, 255, (50, 3), np.uint8)
+    )
     report = {"registered": 5, "images": 5, "points": 50, "hr": ["left"], "lr": ["right"]}
-    (folder / frozen.REPORT).write_text(json.dumps(report))
+    (folder / saved_variant.REPORT).write_text(json.dumps(report))
     content = {
         "key": key,
         "scene": "motorcycle",
         "factor": 2,
         "held_out": True,
         "views": sorted(views, key=lambda view: (view["split"], view["name"])),
-        "files": sealed.hashes(folder, [frozen.POINTS, *(str(view["file"]) for view in views)]),
+        "files": checksums.hashes(
+            folder, [saved_variant.POINTS, *(str(view["file"]) for view in views)]
+        ),
     }
-    manifest = msgspec.convert(content, frozen.Manifest)
+    manifest = msgspec.convert(content, saved_variant.Manifest)
     manifest = msgspec.structs.replace(manifest, id=manifest.computed_id())
-    write_json(folder / frozen.MANIFEST, msgspec.to_builtins(manifest))
+    write_json(folder / saved_variant.MANIFEST, msgspec.to_builtins(manifest))
     return folder.rename(variants / manifest.id).name
 
 

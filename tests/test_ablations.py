@@ -11,7 +11,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from xrgs.config import CONF_DIR, Conf
-from xrgs.experiment import identity
+from xrgs.store import identity
 from xrgs.sweep.axes import expand
 
 ABLATIONS = sorted({path.stem for path in (CONF_DIR / "ablation").glob("*.yaml")} - {"baseline"})

@@ -240,8 +240,8 @@ def checkout(backend: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> P
     """A checkout of the file that reads commits, which the backend takes for its own."""
     monkeypatch.setenv("PATH", os.defpath)
     package = tmp_path / "checkout" / "xrgs"
-    (package / "experiment").mkdir(parents=True)
-    shutil.copy(FILE.parents[1] / "xrgs/experiment/commit.py", package / "experiment")
+    (package / "store").mkdir(parents=True)
+    shutil.copy(FILE.parents[1] / "xrgs/store/commit.py", package / "store")
     (package.parent / ".gitignore").write_text("/xrgs/_commit.json\n__pycache__/\n")
     monkeypatch.setattr(backend, "_ROOT", package.parent)
     git(package.parent, "init", "--quiet")

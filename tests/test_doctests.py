@@ -15,7 +15,7 @@ import torch
 
 import xrgs
 from tests import reference_store
-from xrgs.capture.dataset import Dataset
+from xrgs.training.dataset import Dataset
 
 PACKAGE = Path(xrgs.__file__).parent
 MODULES = [

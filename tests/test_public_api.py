@@ -13,9 +13,9 @@ from types import ModuleType
 import pytest
 
 import xrgs
-from xrgs.capture.dataset import Dataset
 from xrgs.config import Conf
 from xrgs.training import count_matching
+from xrgs.training.dataset import Dataset
 
 HEAVY = ("torch", "pandas", "numpy", "hydra", "kornia", "pycolmap", "matplotlib", "skimage")
 #: Names for planning and for looking at results; using them must not import torch.

@@ -168,7 +168,7 @@ def test_a_refactoring_of_the_code_of_variants_is_proven_and_keeps_variants_and_
     copy: Copy,
 ) -> None:
     before = json.loads((copy.root / "xrgs/safeio/refactorings.json").read_text())
-    copy.edit("capture/sfm.py", "_TOTAL_FEATURES = 100_000", "_TOTAL_FEATURES = 100 * 1_000")
+    copy.edit("mixture/sfm.py", "_TOTAL_FEATURES = 100_000", "_TOTAL_FEATURES = 100 * 1_000")
     assert "2 cells, 0 done" in done_cells(copy)
     printed = copy.run("store", "prove", "--store", "s")
     assert "1 variant built again, the same bit for bit" in printed
@@ -189,7 +189,7 @@ def test_a_refactoring_of_the_code_of_variants_is_proven_and_keeps_variants_and_
 def test_other_cameras_are_not_declared(copy: Copy) -> None:
     file = copy.root / "xrgs/safeio/refactorings.json"
     before = file.read_bytes()
-    copy.edit("capture/sfm.py", "_SMALL_SIDE = 800", "_SMALL_SIDE = 8")
+    copy.edit("mixture/sfm.py", "_SMALL_SIDE = 800", "_SMALL_SIDE = 8")
     with pytest.raises(AssertionError, match="views, files differ; nothing is declared"):
         copy.run("store", "prove", "--store", "s")
     assert file.read_bytes() == before

@@ -14,7 +14,7 @@ import pytest
 
 import xrgs
 from xrgs.cli.key_help import entries
-from xrgs.training.registry import BUILT_IN
+from xrgs.registry import BUILT_IN
 
 pytestmark = pytest.mark.slow
 

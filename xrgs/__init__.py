@@ -8,7 +8,7 @@ From Python, `import xrgs` gives:
 - `load_gaussians`, `save_gaussians`, `Gaussians`, `Camera`: Gaussians in and out as .ply, .glb or
   .spz, and views of them.
 - `rasterize`: render Gaussians with a camera, with settings in `RasterSettings`; gives a `Render`.
-  `xrgs.splat.gsplat_api` has `rasterization`, with gsplat's signature and results.
+  `xrgs.formats.gsplat_api` has `rasterization`, with gsplat's signature and results.
 - `compose`: the config of a command line; `build_dataset` or `load_dataset`: what it is trained on;
   `train`: train it.
 - `Store`: the results of sweeps as tables and objects.
@@ -28,15 +28,15 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from xrgs.capture.prepare import build_dataset, load_dataset
     from xrgs.composing import compose
     from xrgs.errors import XrgsError
-    from xrgs.experiment.store import Store
+    from xrgs.formats.files import load_gaussians, save_gaussians
     from xrgs.splat.cameras import Camera
-    from xrgs.splat.files import load_gaussians, save_gaussians
     from xrgs.splat.gaussians import Gaussians
     from xrgs.splat.rendering import Render, rasterize
     from xrgs.splat.settings import RasterSettings
+    from xrgs.store.prepare import build_dataset, load_dataset
+    from xrgs.store.store import Store
     from xrgs.training.count_matching import train_cell as train
 
 __version__ = "0.2.0"
@@ -65,21 +65,21 @@ _MODULES = {
     "Gaussians": "xrgs.splat.gaussians",
     "RasterSettings": "xrgs.splat.settings",
     "Render": "xrgs.splat.rendering",
-    "Store": "xrgs.experiment.store",
+    "Store": "xrgs.store.store",
     "XrgsError": "xrgs.errors",
-    "build_dataset": "xrgs.capture.prepare",
+    "build_dataset": "xrgs.store.prepare",
     "compose": "xrgs.composing",
-    "load_dataset": "xrgs.capture.prepare",
-    "load_gaussians": "xrgs.splat.files",
+    "load_dataset": "xrgs.store.prepare",
+    "load_gaussians": "xrgs.formats.files",
     "rasterize": "xrgs.splat.rendering",
-    "save_gaussians": "xrgs.splat.files",
+    "save_gaussians": "xrgs.formats.files",
     "train": "xrgs.training.count_matching",
 }
 #: Names of version 0.2 that the next one removes: their modules, and what to use.
 _DEPRECATED = {
-    "load_ply": ("xrgs.splat.ply", "xrgs.load_gaussians(path).gaussians"),
-    "rasterization": ("xrgs.splat.gsplat_api", "xrgs.splat.gsplat_api.rasterization"),
-    "save_ply": ("xrgs.splat.ply", "xrgs.save_gaussians"),
+    "load_ply": ("xrgs.formats.ply", "xrgs.load_gaussians(path).gaussians"),
+    "rasterization": ("xrgs.formats.gsplat_api", "xrgs.formats.gsplat_api.rasterization"),
+    "save_ply": ("xrgs.formats.ply", "xrgs.save_gaussians"),
 }
 #: Names that render on the processor, where threads of torch that spin take the cores.
 _RENDERING = ("rasterize", "train")

@@ -20,10 +20,10 @@ from PIL import Image
 from scipy import stats
 from skimage.metrics import peak_signal_noise_ratio
 
-from xrgs.capture.dataset import LoadedView
 from xrgs.composing import compose
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import Gaussians
+from xrgs.training.dataset import LoadedView
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 STAND_IN = Path(__file__).with_name("opensplat_stand_in.py")

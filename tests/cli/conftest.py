@@ -18,11 +18,11 @@ import pytest
 from PIL import Image
 
 import xrgs.report
-from xrgs.capture import variant
 from xrgs.cli import sweep
-from xrgs.experiment.cell_folder import CellFolder
-from xrgs.experiment.store import Store
+from xrgs.mixture import variant
 from xrgs.safeio.atomic import write_json
+from xrgs.store.cell_folder import CellFolder
+from xrgs.store.store import Store
 from xrgs.sweep.jobs import worker
 
 RunCommand = Callable[..., tuple[int, str, str]]

@@ -19,9 +19,9 @@ from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
 import xrgs
-import xrgs.capture.description
-from xrgs.capture import poses, variant
-from xrgs.experiment.cell_folder import CellFolder
+import xrgs.store.inspect
+from xrgs.mixture import poses, variant
+from xrgs.store.cell_folder import CellFolder
 from xrgs.sweep.jobs import worker
 
 XrgsData = Callable[..., tuple[int, str, str]]
@@ -46,7 +46,7 @@ def test_inspect_builds_a_variant_that_the_store_lacks(
 
     monkeypatch.setattr(worker, "run_in_child", build)
     monkeypatch.setattr(variant, "find", lambda *_: SimpleNamespace(id="k-1") if built else None)
-    monkeypatch.setattr(xrgs.capture.description, "describe", lambda folder, out: f"{folder} {out}")
+    monkeypatch.setattr(xrgs.store.inspect, "describe", lambda folder, out: f"{folder} {out}")
     code, out, err = xrgs_data("inspect", "scene=motorcycle", "store=s", "--out", "x.png")
     assert code == 0, err
     assert out.strip() == "s/variants/k-1 x.png"
@@ -68,7 +68,7 @@ def test_inspect_takes_a_folder_of_photographs_as_they_are(
     photographs(tmp_path / "garden", 4)
     monkeypatch.setattr(worker, "run_in_child", build)
     monkeypatch.setattr(variant, "find", lambda *_: None)
-    monkeypatch.setattr(xrgs.capture.description, "describe", lambda folder, out: f"{folder} {out}")
+    monkeypatch.setattr(xrgs.store.inspect, "describe", lambda folder, out: f"{folder} {out}")
     code, out, err = xrgs_data(
         "inspect", "garden", "variant.long_side=99", "variant=distance", "store=s"
     )

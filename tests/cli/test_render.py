@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 import xrgs
-from xrgs.experiment.store import Store
+from xrgs.store.store import Store
 
 RunCommand = Callable[..., tuple[int, str, str]]
 

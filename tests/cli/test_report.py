@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from xrgs.cli.report import report
-from xrgs.experiment.store import Store
 from xrgs.report import Design
+from xrgs.store.store import Store
 
 RunCommand = Callable[..., tuple[int, str, str]]
 

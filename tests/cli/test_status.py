@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from xrgs.experiment.store import Store
+from xrgs.store.store import Store
 
 
 def test_it_prints_what_a_store_holds(

@@ -16,11 +16,11 @@ import pytest
 from tests.cli.conftest import finish
 from xrgs.cli import store as command
 from xrgs.config import Conf
-from xrgs.experiment.attempts import begin_attempt, plan_cell
-from xrgs.experiment.cell_folder import CellFolder
-from xrgs.experiment.identity import cell_identity
-from xrgs.experiment.schema import RecordedCell
-from xrgs.experiment.store import Store
+from xrgs.store.attempts import begin_attempt, plan_cell
+from xrgs.store.cell_folder import CellFolder
+from xrgs.store.identity import cell_identity
+from xrgs.store.schema import RecordedCell
+from xrgs.store.store import Store
 
 Call = Callable[..., tuple[int, str, str]]
 

@@ -11,9 +11,9 @@ import pytest
 from omegaconf import OmegaConf
 from PIL import Image
 
-from xrgs.capture import variant
 from xrgs.config import CONF_DIR
-from xrgs.experiment.store import Store
+from xrgs.mixture import variant
+from xrgs.store.store import Store
 
 SweepHere = Callable[..., tuple[int, str, str]]
 RunCommand = Callable[..., tuple[int, str, str]]

@@ -10,11 +10,11 @@ from typing import Any
 
 import pytest
 
-from xrgs.capture.description import ALIKE_RECIPE, MIXTURE_RECIPE, Mixture, SfmReport
-from xrgs.capture.scenes import motorcycle
 from xrgs.cli import budget, sweep, train
-from xrgs.experiment.cell_folder import CellFolder
-from xrgs.experiment.store import Store
+from xrgs.photos.scenes import motorcycle
+from xrgs.store.cell_folder import CellFolder
+from xrgs.store.inspect import ALIKE_RECIPE, MIXTURE_RECIPE, Mixture, SfmReport
+from xrgs.store.store import Store
 
 RunCommand = Callable[..., tuple[int, str, str]]
 

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from xrgs.formats.ply import save_ply
 from xrgs.splat.gaussians import Gaussians
-from xrgs.splat.ply import save_ply
 
 
 @pytest.mark.slow

@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from numpy.lib.stride_tricks import sliding_window_view
 from torch import Tensor
 
-from xrgs.capture import masks
 from xrgs.evaluation import metrics
 from xrgs.evaluation.lpips import weights
+from xrgs.photos import masks
 
 #: Whether more of it is better, from the metrics' own papers and common sense, not from the code.
 MORE_IS_BETTER = {

@@ -12,12 +12,12 @@ import pytest
 import torch
 from PIL import Image
 
-from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.config import Conf, SplatConf
 from xrgs.evaluation import protocol
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import Gaussians, from_points
 from xrgs.splat.rendering import rasterize_parameters
+from xrgs.training.dataset import Dataset, LoadedView
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from nbclient import NotebookClient
 from PIL import Image
 
 from xrgs import load_gaussians
-from xrgs.capture.scenes import procedural, still_life
+from xrgs.photos.scenes import procedural, still_life
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 SIZE = (320, 240)

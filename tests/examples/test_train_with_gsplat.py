@@ -21,7 +21,7 @@ from PIL import Image
 from tests import reference_store as reference
 from xrgs import Gaussians, Store
 from xrgs.evaluation.files import score_file
-from xrgs.splat.gsplat_api import rasterization
+from xrgs.formats.gsplat_api import rasterization
 
 
 def test_ssim_is_kornias_over_the_windows_inside(script: Callable[[str], ModuleType]) -> None:

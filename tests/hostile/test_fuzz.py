@@ -31,7 +31,6 @@ import pytest
 import torch
 
 from tests import reference_store
-from tests.capture.made_files import DISPLAY_P3, png, profile
 from tests.hostile.mutations import (
     Mutation,
     mutate_bytes,
@@ -40,22 +39,24 @@ from tests.hostile.mutations import (
     mutate_json,
     mutate_npz,
 )
+from tests.photos.made_files import DISPLAY_P3, png, profile
 from xrgs import composing
-from xrgs.capture import colmap, exif, frozen, images, poses
-from xrgs.capture.folders import read_failure
-from xrgs.capture.photographs import PhotoCollection, prepare_hr_views
-from xrgs.capture.scenes import Scene
-from xrgs.capture.scenes.rendered import RenderedScene
 from xrgs.errors import StoreError, XrgsError
 from xrgs.evaluation.lpips import weights
-from xrgs.experiment.archive import import_store
-from xrgs.experiment.schema import Identity, Provenance, Status, Summary, SweepRecord
-from xrgs.experiment.store import Store
+from xrgs.formats.files import load_gaussians, save_gaussians
+from xrgs.formats.ply import load_ply
+from xrgs.mixture import colmap, poses, saved_variant
+from xrgs.mixture.paths import read_failure
+from xrgs.mixture.photographs import PhotoCollection, prepare_hr_views
+from xrgs.photos import exif, images
+from xrgs.photos.scenes import Scene
+from xrgs.photos.scenes.rendered import RenderedScene
 from xrgs.runtime import lease, progress
 from xrgs.safeio import npz
 from xrgs.safeio.records import read_struct, read_table
-from xrgs.splat.files import load_gaussians, save_gaussians
-from xrgs.splat.ply import load_ply
+from xrgs.store.archive import import_store
+from xrgs.store.schema import Identity, Provenance, Status, Summary, SweepRecord
+from xrgs.store.store import Store
 from xrgs.training.checkpoint import Checkpoint
 
 MAX_CPU_S = 2.0
@@ -222,7 +223,7 @@ def import_archive(file: Path) -> None:
     shutil.rmtree(imported.path, ignore_errors=True)
     import_store(file, imported)
     assert all(cell.state().name == "done" for cell in imported.cell_folders())
-    assert all(frozen.verify(folder) == [] for folder in imported.variants.iterdir())
+    assert all(saved_variant.verify(folder) == [] for folder in imported.variants.iterdir())
 
 
 def read_npz(file: Path) -> object:
@@ -288,7 +289,7 @@ PARSERS = {
             "cells/*/summary.json": Summary,
             "cells/*/provenance.json": Provenance,
             "sweeps/*.json": SweepRecord,
-            "variants/*/variant.json": frozen.Manifest,
+            "variants/*/variant.json": saved_variant.Manifest,
         }.items()
     },
 }

@@ -13,13 +13,13 @@ from PIL import Image
 
 from tests.conftest import composed
 from xrgs.evaluation.metrics import VIEW_METRICS
-from xrgs.evaluation.scoring import scoring_code
-from xrgs.experiment.attempts import begin_attempt
-from xrgs.experiment.cell_folder import CellFolder
-from xrgs.experiment.schema import Identity, Provenance, RecordedCell
-from xrgs.experiment.store import Store
 from xrgs.report.collect import Sweep, read_cells
 from xrgs.safeio.atomic import write_json
+from xrgs.store.attempts import begin_attempt
+from xrgs.store.cell_folder import CellFolder
+from xrgs.store.schema import Identity, Provenance, RecordedCell
+from xrgs.store.scoring import scoring_code
+from xrgs.store.store import Store
 
 SUMMARY = {
     "training_time_s": 100.0,

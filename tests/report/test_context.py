@@ -14,12 +14,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.report.conftest import configured, finish_again
-from xrgs.capture.description import SfmReport
 from xrgs.evaluation.metrics import METRICS
 from xrgs.report.compare import Comparison, compare
 from xrgs.report.context import Context, contexts, decided_by_one_view
 from xrgs.report.page import build
 from xrgs.report.tables import Tables
+from xrgs.store.inspect import SfmReport
 
 
 def found(made: Any) -> dict[str, Context]:

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio
 
-from xrgs.capture import frozen
-from xrgs.capture.views import Variant, View
 from xrgs.errors import XrgsError
+from xrgs.mixture import saved_variant
+from xrgs.mixture.views import Variant, View
 from xrgs.report import build
 from xrgs.report.collect import ReportError
 from xrgs.report.external import External, parse, with_external
@@ -52,7 +52,7 @@ def frozen_variant(made: MakeStore) -> Callable[[int], str]:
         points = np.random.default_rng(0).normal(size=(5, 3))
         colors = np.zeros((5, 3), np.uint8)
         variant = Variant("", folder, "fern", 5, True, tuple(views), points, colors, {})
-        return frozen.freeze(variant, f"{draw:016x}", folder, made.store.variants, {}).id
+        return saved_variant.freeze(variant, f"{draw:016x}", folder, made.store.variants, {}).id
 
     return make
 
@@ -225,7 +225,7 @@ def test_a_damaged_variant_is_no_truth(
     sweep = made.read()
     photograph = made.store.path / "variants" / variant / "images" / "test" / "IMG_001.png"
     shutil.copy(rendered(tmp_path / "r") / "IMG_001.png", photograph)
-    with pytest.raises(frozen.CorruptVariant, match=r"IMG_001\.png"):
+    with pytest.raises(saved_variant.CorruptVariant, match=r"IMG_001\.png"):
         with_external(sweep, JoinedStore((made.store,)), [External("gsplat", tmp_path / "r")])
 
 

@@ -10,12 +10,12 @@ import msgspec
 import pytest
 
 from xrgs.errors import StoreError
-from xrgs.experiment.attempts import remove_cell
-from xrgs.experiment.store import Store
 from xrgs.report import Choice, build
 from xrgs.report.collect import ReportError
 from xrgs.report.joined import JoinedStore, report_name
 from xrgs.safeio.records import read_table
+from xrgs.store.attempts import remove_cell
+from xrgs.store.store import Store
 
 
 def table(folder: Path) -> dict[str, float]:

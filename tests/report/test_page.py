@@ -16,8 +16,8 @@ import pytest
 
 import xrgs
 from tests.report.conftest import VIEWS, configured, finish_again
-from xrgs.capture.folders import TO_TRY
 from xrgs.errors import StoreError
+from xrgs.mixture.paths import TO_TRY
 from xrgs.report import build
 from xrgs.report.collect import ReportError
 from xrgs.report.figures import trade_off

@@ -9,18 +9,18 @@ import pytest
 from msgspec import to_builtins
 from msgspec.structs import replace
 
-from tests.capture.manifests import one_view
+from tests.mixture.manifests import one_view
 from tests.report.conftest import finish_again
-from xrgs.capture import description
 from xrgs.report.page import build
 from xrgs.safeio.atomic import write_json
+from xrgs.store import inspect
 
 
 @pytest.mark.parametrize("folder", ["v", "trimmed-v"])
 def test_a_report_has_all_notes_of_a_scene_s_variants(
     made: Any, folder: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(description, "read_manifest", lambda _: one_view())
+    monkeypatch.setattr(inspect, "read_manifest", lambda _: one_view())
     names = [f"IMG_{number:04d}" for number in range(40)]
     content = {"tests": 40, "hr": ["a"], "lr": ["b"], "not_registered": names}
     home = made.store.variants / folder

@@ -64,7 +64,7 @@ faulthandler.enable()
 def imported():
     from xrgs.runtime.signals import handlers_kept
     with handlers_kept():  # as where a variant is built
-        from xrgs.capture import sfm
+        from xrgs.mixture import sfm
 threading.Thread(target=imported).start() if {thread} else imported()
 [thread.join() for thread in threading.enumerate() if thread is not threading.current_thread()]
 os.kill(os.getpid(), signal.{name})

@@ -17,12 +17,12 @@ from omegaconf import DictConfig
 
 from xrgs import config
 from xrgs.config import Conf
-from xrgs.experiment.attempts import begin_attempt, plan_cell
-from xrgs.experiment.cell_folder import CellFolder
-from xrgs.experiment.identity import cell_id, cell_identity
-from xrgs.experiment.schema import RecordedCell
-from xrgs.experiment.store import Store
 from xrgs.safeio.atomic import write_json
+from xrgs.store.attempts import begin_attempt, plan_cell
+from xrgs.store.cell_folder import CellFolder
+from xrgs.store.identity import cell_id, cell_identity
+from xrgs.store.schema import RecordedCell
+from xrgs.store.store import Store
 from xrgs.sweep.session import SweepSession
 from xrgs.sweep.study import Study
 

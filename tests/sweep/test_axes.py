@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from xrgs.errors import XrgsError
-from xrgs.experiment.store import BASELINE
+from xrgs.store.store import BASELINE
 from xrgs.sweep.axes import effective, expand
 
 

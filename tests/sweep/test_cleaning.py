@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 
 from xrgs.errors import XrgsError
-from xrgs.experiment.attempts import remove_cell
-from xrgs.experiment.cell_folder import CellFolder
-from xrgs.experiment.store import Store
 from xrgs.runtime import lease
+from xrgs.store.attempts import remove_cell
+from xrgs.store.cell_folder import CellFolder
+from xrgs.store.store import Store
 from xrgs.sweep.cleaning import GARBAGE, Plan, carry_out, plan_gc, plan_removal, plan_trim
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import pytest
 
 from xrgs.errors import XrgsError
-from xrgs.experiment.store import BASELINE
+from xrgs.store.store import BASELINE
 from xrgs.sweep.controls import mixed_prune_rules
 from xrgs.sweep.plan import PlannedCell
 from xrgs.sweep.study import Study

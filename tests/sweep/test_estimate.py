@@ -13,12 +13,12 @@ from typing import Any
 import msgspec
 import pytest
 
-from xrgs.capture import frozen
 from xrgs.config import Conf
 from xrgs.errors import StoreError
-from xrgs.experiment import provenance
+from xrgs.mixture import saved_variant
 from xrgs.safeio.atomic import write_json
 from xrgs.splat import backend
+from xrgs.store import provenance
 from xrgs.sweep import estimate
 from xrgs.sweep.estimate import TORCH_SLOWDOWN, Cost, CostEstimator
 
@@ -193,7 +193,7 @@ def sizes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[Conf], e
 
     def view(name: str, split: str, tag: str, side: int, need: float) -> SimpleNamespace:
         size = {"width": side, "height": side}
-        return SimpleNamespace(name=name, split=split, tag=tag, need=need, **size)
+        return SimpleNamespace(name=name, split=split, tag=tag, supersampling=need, **size)
 
     made = [
         *(view(name, "train", "HR", 200, 1.2) for name in "ab"),
@@ -206,7 +206,7 @@ def sizes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[Conf], e
         assert folder == tmp_path / "trimmed-k-1"
         return SimpleNamespace(views=made)
 
-    monkeypatch.setattr(frozen, "read_manifest", read)
+    monkeypatch.setattr(saved_variant, "read_manifest", read)
     return lambda conf: estimate._sizes(tmp_path, "k-1", conf)
 
 

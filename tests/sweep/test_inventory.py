@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 
 from xrgs.errors import XrgsError
-from xrgs.experiment.listing import Selection
-from xrgs.experiment.store import Store
 from xrgs.runtime import lease
+from xrgs.store.listing import Selection
+from xrgs.store.store import Store
 from xrgs.sweep.inventory import list_cells, list_sweeps, show
 
 

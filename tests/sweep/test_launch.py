@@ -18,12 +18,12 @@ from hydra.types import HydraContext
 from omegaconf import DictConfig, OmegaConf
 
 from xrgs import config
-from xrgs.cli.hydra_words import with_quotes
+from xrgs.cli.overrides import with_quotes
 from xrgs.errors import XrgsError
-from xrgs.experiment.attempts import begin_attempt
-from xrgs.experiment.identity import cell_id, cell_identity
-from xrgs.experiment.store import Store
 from xrgs.runtime import lease
+from xrgs.store.attempts import begin_attempt
+from xrgs.store.identity import cell_id, cell_identity
+from xrgs.store.store import Store
 from xrgs.sweep import launch
 from xrgs.sweep.axes import CellSpec
 from xrgs.sweep.jobs.job import INTERRUPTED, UNKNOWN

@@ -13,9 +13,9 @@ import msgspec
 import pytest
 
 from xrgs.config import Conf
-from xrgs.experiment.cell_folder import CellState
 from xrgs.runtime.progress import Progress
 from xrgs.safeio.atomic import write_json
+from xrgs.store.cell_folder import CellState
 from xrgs.sweep import monitor as monitor_module
 from xrgs.sweep.axes import CellSpec
 from xrgs.sweep.estimate import Cost

@@ -9,12 +9,12 @@ from typing import Any
 
 import pytest
 
-from xrgs.capture.folders import TO_TRY
 from xrgs.config import Conf
-from xrgs.experiment.cell_folder import CellState
-from xrgs.experiment.store import BASELINE
+from xrgs.mixture.paths import TO_TRY
 from xrgs.runtime.text import format_duration
 from xrgs.splat import backend
+from xrgs.store.cell_folder import CellState
+from xrgs.store.store import BASELINE
 from xrgs.sweep import plan as plan_module
 from xrgs.sweep.axes import CellSpec
 from xrgs.sweep.estimate import TORCH_SLOWDOWN, Cost

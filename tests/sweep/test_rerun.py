@@ -16,13 +16,13 @@ from PIL import Image
 
 from xrgs.config import Conf
 from xrgs.errors import XrgsError
-from xrgs.experiment import provenance
-from xrgs.experiment.attempts import begin_attempt, plan_cell
-from xrgs.experiment.cell_folder import CellFolder
-from xrgs.experiment.identity import cell_id, cell_identity
-from xrgs.experiment.store import Store
+from xrgs.formats.ply import ANTIALIASED_LINE
 from xrgs.safeio.atomic import write_json
-from xrgs.splat.ply import ANTIALIASED_LINE
+from xrgs.store import provenance
+from xrgs.store.attempts import begin_attempt, plan_cell
+from xrgs.store.cell_folder import CellFolder
+from xrgs.store.identity import cell_id, cell_identity
+from xrgs.store.store import Store
 from xrgs.sweep.jobs import worker
 from xrgs.sweep.rerun import RerunResult, rerun
 

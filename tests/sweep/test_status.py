@@ -18,12 +18,12 @@ import msgspec
 import pytest
 
 from xrgs.errors import XrgsError
-from xrgs.experiment import identity, listing
-from xrgs.experiment.store import Store
 from xrgs.runtime import lease
 from xrgs.runtime.progress import Progress
 from xrgs.safeio.atomic import write_json
 from xrgs.safeio.files import walk_files
+from xrgs.store import identity, listing
+from xrgs.store.store import Store
 from xrgs.sweep.status import describe, read, running
 
 

@@ -18,22 +18,22 @@ from hydra.errors import CompactHydraException
 from omegaconf import DictConfig
 
 from xrgs import config
-from xrgs.capture import scenes
-from xrgs.capture.dataset import USES
 from xrgs.errors import XrgsError
 from xrgs.evaluation.lpips import download, weights
-from xrgs.experiment.attempts import begin_attempt
-from xrgs.experiment.identity import cell_id, cell_identity
-from xrgs.experiment.store import BASELINE, Store
+from xrgs.photos import scenes
+from xrgs.store.attempts import begin_attempt
+from xrgs.store.identity import cell_id, cell_identity
+from xrgs.store.store import BASELINE, Store
+from xrgs.sweep import build_variants
 from xrgs.sweep import plan as plan_module
 from xrgs.sweep import study as study_module
-from xrgs.sweep import variants
 from xrgs.sweep.axes import CellSpec
 from xrgs.sweep.jobs.job import FAIL_FAST, STOPPED, STORE_FULL
 from xrgs.sweep.monitor import SweepMonitor
 from xrgs.sweep.plan import PlannedCell, describe, record
 from xrgs.sweep.session import SweepSession
 from xrgs.sweep.study import Study, check_sizes, provide_lpips
+from xrgs.training.dataset import USES
 
 
 class Launcher:
@@ -316,8 +316,8 @@ def test_a_variant_that_can_not_be_read_makes_its_cells_unknown_until_it_can(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     store, trainer, plan = planned
-    found = [variants.PlannedVariant(unknown="its variant can't be read now: points.npz")]
-    monkeypatch.setattr(variants, "plan", lambda confs, *_, **__: found[-1:] * len(confs))
+    found = [build_variants.PlannedVariant(unknown="its variant can't be read now: points.npz")]
+    monkeypatch.setattr(build_variants, "plan", lambda confs, *_, **__: found[-1:] * len(confs))
     made = study("store=s")
     plan = [replace(cell, variant_id=None, identity=None, cell_id=None) for cell in plan]
     plan = made._identified(made._with_variants(plan, store, allow_build=True), store)
@@ -329,7 +329,7 @@ def test_a_variant_that_can_not_be_read_makes_its_cells_unknown_until_it_can(
     assert {(row.state, row.error) for row in record(final)} == {
         ("unknown", "its variant can't be read now: points.npz")
     }
-    found.append(variants.PlannedVariant("v"))
+    found.append(build_variants.PlannedVariant("v"))
     final = made._run_until_complete(plan, store, [monitor])
     assert [cell.state.name for cell in final] == ["done"] * 2
     assert len(trainer.launched) == 1
@@ -342,8 +342,8 @@ def test_the_notes_of_a_variant_are_said_once_for_all_of_its_cells(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     store, _, plan = planned
-    found = variants.PlannedVariant("v", notes=("icon.png left out", "not placed: IMG_1"))
-    monkeypatch.setattr(variants, "plan", lambda confs, *_, **__: [found] * len(confs))
+    found = build_variants.PlannedVariant("v", notes=("icon.png left out", "not placed: IMG_1"))
+    monkeypatch.setattr(build_variants, "plan", lambda confs, *_, **__: [found] * len(confs))
     study("store=s")._with_variants(plan, store, allow_build=True)
     scene = scenes.label(plan[0].conf.scene)
     said = f"{scene}: icon.png left out\n{scene}: not placed: IMG_1\n"

@@ -19,9 +19,9 @@ from mlflow import MlflowClient
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from xrgs.errors import XrgsError
-from xrgs.experiment.cell_folder import CellFolder, CellState
-from xrgs.experiment.results import cell_columns
-from xrgs.experiment.store import Store
+from xrgs.store.cell_folder import CellFolder, CellState
+from xrgs.store.results import cell_columns
+from xrgs.store.store import Store
 from xrgs.sweep import track, trackers
 from xrgs.sweep.axes import CellSpec
 from xrgs.sweep.plan import PlannedCell

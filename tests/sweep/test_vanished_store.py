@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from xrgs.experiment.store import Store, StoreGoneError
+from xrgs.store.store import Store, StoreGoneError
 
 #: Every cell's process reports that it has begun, and then writes into its folder for ever.
 WRITES_ON = """
@@ -29,8 +29,8 @@ if "xrgs.sweep.jobs.worker" in sys.orig_argv and "cell" in sys.orig_argv:
             write_json(folder.path / "provenance.json", {})
             time.sleep(0.01)
 
-    sys.modules["xrgs.experiment.cell"] = types.ModuleType("xrgs.experiment.cell")
-    sys.modules["xrgs.experiment.cell"].run_cell = run_cell
+    sys.modules["xrgs.store.cell"] = types.ModuleType("xrgs.store.cell")
+    sys.modules["xrgs.store.cell"].run_cell = run_cell
 """
 
 

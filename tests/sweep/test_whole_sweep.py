@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from xrgs.capture import variant
-from xrgs.experiment.cell_folder import CellFolder
-from xrgs.experiment.store import Store
+from xrgs.mixture import variant
 from xrgs.safeio.records import read_table
+from xrgs.store.cell_folder import CellFolder
+from xrgs.store.store import Store
 
 pytestmark = pytest.mark.slow
 

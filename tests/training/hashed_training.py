@@ -15,9 +15,9 @@ import torch
 from torch import Tensor
 
 from xrgs import composing
-from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import PARAMETERS
+from xrgs.training.dataset import Dataset, LoadedView
 from xrgs.training.loop import train
 
 GAUSSIANS = 60_001
@@ -102,7 +102,11 @@ def _dataset() -> Dataset:
         K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
         camera = Camera(viewmat, K, size, size)
         image = _smooth(torch.rand(size, size, 3, generator=generator))
-        views.append(LoadedView(f"v{number}", tag, camera, image, rho=size / 48, need=48 / size))
+        views.append(
+            LoadedView(
+                f"v{number}", tag, camera, image, sampling_rate=size / 48, supersampling=48 / size
+            )
+        )
     colors = torch.rand(GAUSSIANS, 3, generator=generator)
     return Dataset(tuple(views), tuple(views[:1]), points, colors, scene_scale=1.0, factor=2)
 

@@ -20,10 +20,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from tests.training.conftest import comparable
-from xrgs.capture.dataset import Dataset
 from xrgs.config import Conf
 from xrgs.training import checkpoint
 from xrgs.training.checkpoint import Checkpoint, CheckpointError
+from xrgs.training.dataset import Dataset
 from xrgs.training.loop import train
 
 #: Seconds between two checkpoints that are so few that one is written at every step.

@@ -18,12 +18,12 @@ from hypothesis import strategies as st
 
 from tests.conftest import composed as compose
 from tests.training.conftest import comparable
-from xrgs.capture.dataset import Dataset
 from xrgs.config import Conf
 from xrgs.splat.loss import photometric_loss
 from xrgs.training import checkpoint, loop, recorder
 from xrgs.training.checkpoint import Checkpoint
 from xrgs.training.count_matching import train_cell
+from xrgs.training.dataset import Dataset
 from xrgs.training.loop import train
 from xrgs.training.recorder import TrainingResult
 

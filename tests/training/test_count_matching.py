@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from tests.conftest import composed as compose
 from tests.training.conftest import same
-from xrgs.capture.dataset import Dataset
 from xrgs.config import Conf
 from xrgs.errors import XrgsError
 from xrgs.splat.gaussians import Gaussians, from_points
@@ -25,6 +24,7 @@ from xrgs.training.count_matching import (
     next_threshold,
     train_cell,
 )
+from xrgs.training.dataset import Dataset
 
 TOLERANCE = 0.05
 

@@ -18,13 +18,13 @@ from tests.fake_gpu import DEVICE, fake_gpu
 from tests.gsplat_stand_in import ALPHA_MAX, stand_in
 from tests.training.conftest import comparable
 from tests.training.test_loop import ABLATIONS
-from xrgs.capture.dataset import Dataset
 from xrgs.config import Conf
 from xrgs.evaluation import protocol
 from xrgs.splat.gaussians import PARAMETERS
 from xrgs.splat.loss import photometric_loss
 from xrgs.training import loop
 from xrgs.training.checkpoint import Checkpoint
+from xrgs.training.dataset import Dataset
 from xrgs.training.loop import train
 from xrgs.training.memory import TrainingMemory
 

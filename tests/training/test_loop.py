@@ -15,7 +15,6 @@ import torch
 
 from tests.conftest import composed as compose
 from tests.training.conftest import same
-from xrgs.capture.dataset import USES, Dataset
 from xrgs.config import CONF_DIR, Conf
 from xrgs.errors import XrgsError
 from xrgs.splat.gaussians import ActivatedGaussians, Gaussians, from_points
@@ -27,6 +26,7 @@ from xrgs.splat.strategy.default import DefaultStrategy
 from xrgs.training import components, recorder, rendering
 from xrgs.training.components import Step, base
 from xrgs.training.count_matching import train_cell
+from xrgs.training.dataset import USES, Dataset
 from xrgs.training.loop import train
 from xrgs.training.sampler import EpochSampler
 from xrgs.training.seeding import seeded_generator

@@ -17,17 +17,17 @@ from PIL import Image
 from plyfile import PlyData, PlyElement
 from torch import Tensor
 
-from tests.capture.scene_confs import scene_conf
 from tests.conftest import composed as compose
+from tests.photos.scene_confs import scene_conf
 from tests.splat.scenes import noise
 from tests.training.components.conftest import make_view
 from tests.training.conftest import comparable
-from xrgs.capture import dataset, images, variant
-from xrgs.capture.dataset import Dataset, LoadedView
-from xrgs.capture.scenes import procedural, raycast, still_life
-from xrgs.capture.views import Variant, View
 from xrgs.config import ResolutionScheduleConf
 from xrgs.evaluation import protocol
+from xrgs.mixture import variant
+from xrgs.mixture.views import Variant, View
+from xrgs.photos import images
+from xrgs.photos.scenes import procedural, raycast, still_life
 from xrgs.report.paper import texture
 from xrgs.splat.attribution import attribute_pixels
 from xrgs.splat.cameras import Camera
@@ -35,12 +35,14 @@ from xrgs.splat.gaussians import from_points
 from xrgs.splat.loss import photometric_loss, prepare_target
 from xrgs.splat.rendering import rasterize_parameters
 from xrgs.splat.strategy.default import DefaultStrategy
+from xrgs.training import dataset
 from xrgs.training.components import Step
 from xrgs.training.components.mip import sampling_rates
 from xrgs.training.components.resolution_schedule import ResolutionSchedule
 from xrgs.training.components.texture import gradient_magnitude, mean_gradient
 from xrgs.training.components.view_scores import _in_unit_range
 from xrgs.training.components.weighting import _box_mean, region_attenuations
+from xrgs.training.dataset import Dataset, LoadedView
 from xrgs.training.loop import train
 from xrgs.training.rendering import inside_mask
 from xrgs.training.seeding import seeded_generator

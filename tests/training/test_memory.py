@@ -10,12 +10,12 @@ import torch
 
 from tests.conftest import composed
 from tests.training.conftest import same
-from xrgs.capture.dataset import Dataset
 from xrgs.config import Conf
 from xrgs.splat.gaussians import PARAMETERS
 from xrgs.splat.rendering import Render
 from xrgs.training import memory
 from xrgs.training.components import Step, TrainingView
+from xrgs.training.dataset import Dataset
 from xrgs.training.loop import train
 from xrgs.training.memory import OnDemand, TrainingMemory, tensors_in
 

@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from tests.conftest import composed as compose
-from xrgs.capture.dataset import Dataset
 from xrgs.config import Conf
 from xrgs.splat.gaussians import Gaussians, from_points
 from xrgs.splat.optimizer import SplatOptimizer
@@ -18,6 +17,7 @@ from xrgs.splat.settings import OptimizerSettings
 from xrgs.splat.strategy.refinement import Refinement
 from xrgs.training import loop, recorder
 from xrgs.training.components import Step
+from xrgs.training.dataset import Dataset
 from xrgs.training.recorder import TrainingRecorder
 
 

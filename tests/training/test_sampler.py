@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from xrgs.capture.dataset import Dataset
 from xrgs.errors import XrgsError
 from xrgs.training.components import Step
+from xrgs.training.dataset import Dataset
 from xrgs.training.sampler import EpochSampler
 from xrgs.training.seeding import seeded_generator
 

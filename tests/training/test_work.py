@@ -7,12 +7,12 @@ import dataclasses
 import pytest
 import torch
 
-from xrgs.capture.dataset import Dataset
 from xrgs.config import Conf
 from xrgs.splat.gaussians import from_points
 from xrgs.splat.rendering import Render
 from xrgs.training import components, loop
 from xrgs.training.components import Step
+from xrgs.training.dataset import Dataset
 from xrgs.training.work import StepWork
 
 

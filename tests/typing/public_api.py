@@ -11,7 +11,7 @@ from torch import Tensor
 
 import xrgs
 from xrgs import Camera, Gaussians, RasterSettings, Store, load_gaussians, rasterize
-from xrgs.splat.gsplat_api import rasterization
+from xrgs.formats.gsplat_api import rasterization
 
 gaussians = load_gaussians("splats.ply").gaussians
 assert_type(gaussians, Gaussians)

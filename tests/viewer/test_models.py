@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 
 from xrgs.errors import StoreError, XrgsError
-from xrgs.experiment.attempts import begin_attempt
-from xrgs.experiment.listing import Selection
-from xrgs.experiment.schema import RecordedCell
-from xrgs.experiment.store import Store
-from xrgs.splat.files import save_gaussians
-from xrgs.splat.ply import save_ply
+from xrgs.formats.files import save_gaussians
+from xrgs.formats.ply import save_ply
 from xrgs.splat.settings import RasterSettings
+from xrgs.store.attempts import begin_attempt
+from xrgs.store.listing import Selection
+from xrgs.store.schema import RecordedCell
+from xrgs.store.store import Store
 from xrgs.viewer import models
 from xrgs.viewer.models import Model
 

@@ -201,7 +201,7 @@ def load_from_cell(folder: Path, view_name: str) -> Load:
     Raises:
         XrgsError: The cell isn't done, its variant isn't in the store, or it has no such view.
     """
-    from xrgs.experiment.cell_folder import CellFolder
+    from xrgs.store.cell_folder import CellFolder
 
     cell = CellFolder(folder)
     state = cell.state()

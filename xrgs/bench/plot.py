@@ -19,7 +19,7 @@ from xrgs.bench.growth import ALL_LOADS
 from xrgs.bench.rendering import TORCH_FLOAT64, total_ms
 from xrgs.bench.timing import Row
 from xrgs.bench.training import STEP_PARTS
-from xrgs.capture.images import SOFTWARE
+from xrgs.photos.images import SOFTWARE
 
 _DPI = 150
 _SIZE = (4.6, 4.2)  # of a panel, inches

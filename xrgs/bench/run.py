@@ -9,13 +9,13 @@ import msgspec
 
 from xrgs.bench import against, growth, loads, plot, rendering, tables, training
 from xrgs.errors import XrgsError
-from xrgs.experiment import provenance
 from xrgs.runtime.machine import usable_cores
 from xrgs.runtime.progress import progress
 from xrgs.safeio.atomic import atomic_writer, write_json
 from xrgs.safeio.records import table_text
 from xrgs.safeio.sanitize import for_csv
 from xrgs.splat.backend import resolve_backend
+from xrgs.store import provenance
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

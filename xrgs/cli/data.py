@@ -10,18 +10,18 @@ from tyro.conf import Positional, arg
 from tyro.extras import literal_type_from_choices
 
 from xrgs import config
-from xrgs.capture.folders import is_failed
-from xrgs.capture.frozen import MANIFEST
-from xrgs.capture.scenes.scene import ALL_BELOW
 from xrgs.cli import options
 from xrgs.cli.options import STORE, Folder, Names, OptionalFolder, shown_as
 from xrgs.cli.photographs import as_they_are, last_of_each_key
 from xrgs.errors import XrgsError
-from xrgs.experiment.cell_folder import IDENTITY, CellFolder
-from xrgs.experiment.export import SPLAT_FORMATS
-from xrgs.experiment.store import Store
+from xrgs.mixture.paths import is_failed
+from xrgs.mixture.saved_variant import MANIFEST
+from xrgs.photos.scenes.scene import ALL_BELOW
 from xrgs.runtime.streams import say
 from xrgs.safeio.paths import user_path
+from xrgs.store.cell_folder import IDENTITY, CellFolder
+from xrgs.store.export import SPLAT_FORMATS
+from xrgs.store.store import Store
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -55,7 +55,7 @@ def download(
     """
     from omegaconf import OmegaConf
 
-    from xrgs.capture.download.scenes import DatasetConf, fetch_scenes
+    from xrgs.photos.download.scenes import DatasetConf, fetch_scenes
 
     known: Any = OmegaConf.to_container(
         OmegaConf.load(config.CONF_DIR / "data" / f"{dataset}.yaml")
@@ -100,7 +100,7 @@ def inspect(
             its id, or a cell of it.
         out: The file of the sheet; by default it is named after the variant.
     """
-    from xrgs.capture.description import describe
+    from xrgs.store.inspect import describe
 
     if not variant:
         raise XrgsError("inspect: give a folder of photographs, or scene=NAME and other keys")
@@ -110,8 +110,8 @@ def inspect(
 def _variant(words: Sequence[str]) -> Path:
     """Return the folder of the variant that the words of `inspect` name; it is built if need be."""
     from xrgs import composing
-    from xrgs.cli.hydra_words import explained, with_quotes
-    from xrgs.sweep import variants
+    from xrgs.cli.overrides import explained, with_quotes
+    from xrgs.sweep import build_variants
 
     first, *others = words
     path = user_path(first.removesuffix(ALL_BELOW))
@@ -129,7 +129,7 @@ def _variant(words: Sequence[str]) -> Path:
     with explained():
         conf = composing.compose(*with_quotes(words))
         store = Store(Path(conf.store))
-        return store.variants / variants.find_or_build(conf, store)
+        return store.variants / build_variants.find_or_build(conf, store)
 
 
 def export(
@@ -186,8 +186,8 @@ def write_export(path: Path, out: Path | None, layout: str = "auto") -> str:
     Raises:
         XrgsError: The cell can't be exported so, or `out` can't be written.
     """
-    from xrgs.experiment.export import export as write
-    from xrgs.experiment.export import export_splats
+    from xrgs.store.export import export as write
+    from xrgs.store.export import export_splats
 
     if layout == "auto":
         layout = "colmap" if out is None else form_of(out)

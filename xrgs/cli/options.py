@@ -1,7 +1,7 @@
 """What all commands but `xrgs-sweep` share: their options, by tyro, and errors as messages.
 
 tyro makes help, completion and messages about wrong usage from typed functions and their
-docstrings. `xrgs-sweep` takes Hydra's overrides instead, see `hydra_words`.
+docstrings. `xrgs-sweep` takes Hydra's overrides instead, see `overrides`.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, Pri
 import xrgs
 from xrgs.config import known_keys
 from xrgs.errors import XrgsError
-from xrgs.experiment.store import DEFAULT_STORE
 from xrgs.runtime.streams import guard_streams, say
 from xrgs.safeio.paths import user_path
 from xrgs.safeio.sanitize import for_line
+from xrgs.store.store import DEFAULT_STORE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Container, Iterator, Mapping, Sequence

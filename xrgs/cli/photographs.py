@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from xrgs.capture.images import SUFFIXES
-from xrgs.capture.scenes.folder import VIDEOS
-from xrgs.capture.scenes.scene import ALL_BELOW
 from xrgs.errors import XrgsError
+from xrgs.photos.images import SUFFIXES
+from xrgs.photos.scenes.folder import VIDEOS
+from xrgs.photos.scenes.scene import ALL_BELOW
 from xrgs.safeio.paths import user_path
 
 if TYPE_CHECKING:

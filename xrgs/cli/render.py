@@ -9,9 +9,9 @@ from tyro.conf import Positional, arg
 
 from xrgs.cli import options
 from xrgs.cli.options import STORE, Cells, Folder, shown_as
-from xrgs.experiment.store import Store
 from xrgs.runtime.signals import exit_on_signal
 from xrgs.runtime.streams import say
+from xrgs.store.store import Store
 
 #: The values of --antialiased.
 _CHOICES = {"yes": True, "no": False, None: None}

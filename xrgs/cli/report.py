@@ -10,8 +10,8 @@ from tyro.conf import arg
 from xrgs.cli import options
 from xrgs.cli.options import STORE, Folder, Names, OptionalFolder, shown_as
 from xrgs.errors import StoreError
-from xrgs.experiment.store import BASELINE, Store
 from xrgs.runtime.streams import say
+from xrgs.store.store import BASELINE, Store
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

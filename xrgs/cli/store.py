@@ -12,15 +12,15 @@ from tyro.conf import Positional, arg
 from xrgs.cli import options
 from xrgs.cli.options import STORE, Cells, Flag, Folder, Names, shown_as
 from xrgs.errors import XrgsError
-from xrgs.experiment.store import Store
 from xrgs.runtime.signals import exit_on_signal
 from xrgs.runtime.streams import say
 from xrgs.safeio.sanitize import counted
+from xrgs.store.store import Store
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from xrgs.experiment.listing import CellRow, Selection
+    from xrgs.store.listing import CellRow, Selection
     from xrgs.sweep.cleaning import Plan
 
 
@@ -47,7 +47,7 @@ class Filter:
 
     def selection(self) -> Selection:
         """Return the options as the functions of the store take them."""
-        from xrgs.experiment.listing import Selection
+        from xrgs.store.listing import Selection
 
         names = self.ids, self.scenes, self.ablations, self.states, self.sweep
         return Selection(*names, self.older_days, self.larger_mb)
@@ -106,7 +106,7 @@ def show(cell: Positional[Annotated[str, arg(metavar="CELL")]], store: Folder = 
         cell: The cell's id, or the beginning of it, or the name of a scene with one done cell.
         store: The store.
     """
-    from xrgs.experiment.listing import Selection
+    from xrgs.store.listing import Selection
     from xrgs.sweep.inventory import show as described
 
     (chosen,) = Selection(ids=(cell,)).of(Store(store).cell_rows())
@@ -156,8 +156,8 @@ def pack(cells: Filter, out: Annotated[Path, arg(metavar="FILE.tar.xz")]) -> Non
         cells: The cells that pass all of these options.
         out: The archive to write.
     """
-    from xrgs.experiment import archive
     from xrgs.runtime.text import format_size
+    from xrgs.store import archive
 
     if not out.name.endswith(".tar.xz"):
         raise XrgsError(f"--out {out}: name the archive to write, FILE.tar.xz")
@@ -182,7 +182,7 @@ def import_(
         source: An archive (.tar, .tar.xz, .tar.gz), or the folder of a store.
         store: The store to copy to.
     """
-    from xrgs.experiment import archive
+    from xrgs.store import archive
 
     imported = archive.import_store(source, Store(store))
     say(f"{source}: {imported}")
@@ -219,7 +219,7 @@ def rescore(cells: Filter, also: Names = ()) -> None:
         also: Slow scores to add: lpips_vgg, which takes 3 s for a view of 500 x 375 px. Its weights
             are fetched by `xrgs-data lpips --network vgg`.
     """
-    from xrgs.experiment import rescoring
+    from xrgs.store import rescoring
 
     _, chosen = cells.chosen()
     done = [cell.folder for cell in chosen if cell.folder.status_file.exists()]
@@ -255,7 +255,7 @@ def check(store: Folder = STORE) -> None:
     Args:
         store: The store.
     """
-    from xrgs.experiment.verification import describe, verify
+    from xrgs.store.verification import describe, verify
 
     verification = verify(Store(store))
     say(describe(verification))

@@ -15,9 +15,9 @@ from hydra.errors import CompactHydraException
 from omegaconf import MISSING, DictConfig, OmegaConf
 
 from xrgs import config
-from xrgs.cli.hydra_words import check_words, explained, files, with_options_first, with_quotes
 from xrgs.cli.key_help import explain
 from xrgs.cli.options import answer_version, errors_as_messages
+from xrgs.cli.overrides import check_words, explained, files, with_options_first, with_quotes
 from xrgs.composing import escape_interpolations
 from xrgs.runtime.signals import exit_on_signal
 from xrgs.runtime.streams import guard_streams, say
@@ -89,7 +89,7 @@ def _run_job(cfg: DictConfig) -> str:
     """Run one job; Hydra's launcher calls this, while Hydra's sweeper plans and launches."""
     if "cell" not in cfg:
         raise CompactHydraException("hydra.mode must be MULTIRUN, as conf/config.yaml sets it")
-    from xrgs.experiment.store import Store
+    from xrgs.store.store import Store
     from xrgs.sweep.jobs.job import INTERRUPTED, run_job
     from xrgs.sweep.session import SweepSession
 
@@ -167,7 +167,7 @@ def _hydra_errors(command: str) -> Iterator[None]:
 
 
 def _rerun(arguments: list[str]) -> None:
-    from xrgs.experiment.store import DEFAULT_STORE, Store
+    from xrgs.store.store import DEFAULT_STORE, Store
     from xrgs.sweep.rerun import rerun
 
     hint = " (rerun= takes out=, store=, threads=, scene.path= and plugins=)"

@@ -16,27 +16,27 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from xrgs import composing
-from xrgs.capture import scenes
 from xrgs.cli import budget, options, sweep
 from xrgs.cli.data import form_of, write_export
-from xrgs.cli.hydra_words import check_no_axis, explained, with_quotes
 from xrgs.cli.options import STORE, Flag, Folder, OptionalFolder, shown_as
+from xrgs.cli.overrides import check_no_axis, explained, with_quotes
 from xrgs.cli.photographs import as_they_are, last_of_each_key
 from xrgs.errors import StoreError, XrgsError
-from xrgs.experiment.store import BASELINE, Store
+from xrgs.photos import scenes
 from xrgs.runtime.machine import usable_cores
 from xrgs.runtime.signals import exit_on_signal
 from xrgs.runtime.streams import say
 from xrgs.runtime.text import format_duration
 from xrgs.safeio.sanitize import counted, for_line
 from xrgs.splat.settings import NOMINAL_STEPS
+from xrgs.store.store import BASELINE, Store
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from xrgs.capture.description import Mixture, SfmReport
     from xrgs.config import Conf
-    from xrgs.experiment.cell_folder import CellFolder
+    from xrgs.store.cell_folder import CellFolder
+    from xrgs.store.inspect import Mixture, SfmReport
 
 #: The overrides of each quality.
 _QUALITIES = {
@@ -177,9 +177,9 @@ def _look(words: _Words) -> _Found | None:
     Raises:
         XrgsError: There are too few photographs, or too few are placed.
     """
-    from xrgs.capture.description import mixture
     from xrgs.report.joined import JoinedStore
-    from xrgs.sweep import variants
+    from xrgs.store.inspect import mixture
+    from xrgs.sweep import build_variants
     from xrgs.sweep.estimate import read_views
 
     conf = words.compose()
@@ -189,7 +189,7 @@ def _look(words: _Words) -> _Found | None:
     _say(f"{name}: {counted(len(photographs), kind)} found")
     if not conf.dry_run:
         store.prepare()
-    (planned,) = variants.plan([conf], store, allow_build=not conf.dry_run)
+    (planned,) = build_variants.plan([conf], store, allow_build=not conf.dry_run)
     if planned.error or planned.unknown:
         raise XrgsError(planned.error or f"{planned.unknown}; run the same command again")
     for note in planned.notes:
@@ -290,7 +290,7 @@ def _say_end(found: _Found, conf: Conf, settings: Settings, seconds: float) -> N
 
 
 def _cell(found: _Found, conf: Conf) -> CellFolder:
-    from xrgs.experiment.identity import cell_id, cell_identity
+    from xrgs.store.identity import cell_id, cell_identity
 
     return Store(conf.store).cell(cell_id(cell_identity(conf, found.variant_id)))
 

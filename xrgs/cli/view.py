@@ -10,10 +10,10 @@ from tyro.conf import Positional
 from xrgs.cli import options
 from xrgs.cli.options import STORE, Cells, Folder
 from xrgs.errors import XrgsError
-from xrgs.experiment.store import Store
 from xrgs.runtime.signals import StopSignal, exit_on_signal
 from xrgs.runtime.streams import say
 from xrgs.safeio.sanitize import for_line
+from xrgs.store.store import Store
 
 
 def view(

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from xrgs.capture import images
 from xrgs.evaluation.metrics import score_view
+from xrgs.photos import images
 from xrgs.runtime.machine import single_torch_thread
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from xrgs.capture.views import View
+    from xrgs.mixture.views import View
 
 
 def score_file(render: Path, view: View, *, masked: bool) -> dict[str, float | None]:

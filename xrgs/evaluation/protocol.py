@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 
     from torch import Tensor
 
-    from xrgs.capture.dataset import LoadedView
     from xrgs.config import SplatConf
     from xrgs.splat.gaussians import Gaussians
+    from xrgs.training.dataset import LoadedView
 
 
 def score_views(
@@ -42,7 +42,7 @@ def score_views(
         One row per view: its name under `view`, and each metric's value under the metric's name,
         None where the metric is not available.
     """
-    from xrgs.capture import images
+    from xrgs.photos import images
     from xrgs.runtime.progress import progress
 
     renders.mkdir(exist_ok=True)

@@ -16,22 +16,22 @@ import pandas as pd
 
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.evaluation.metrics import METRICS, ON_REQUEST, VIEW_METRICS
-from xrgs.evaluation.scoring import PROTOCOL, stale_scores, without_refactorings
-from xrgs.experiment.cell_folder import CellState
-from xrgs.experiment.provenance import machine
-from xrgs.experiment.results import over_views
 from xrgs.runtime.progress import progress
 from xrgs.safeio.records import as_number, read_table
 from xrgs.safeio.sanitize import for_line
+from xrgs.store.cell_folder import CellState
+from xrgs.store.provenance import machine
+from xrgs.store.results import over_views
+from xrgs.store.scoring import PROTOCOL, stale_scores, without_refactorings
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
-    from xrgs.capture.description import SfmReport
     from xrgs.config import Conf
-    from xrgs.experiment.cell_folder import CellFolder
-    from xrgs.experiment.schema import Identity, Provenance, RecordedCell, Status, Summary
+    from xrgs.store.cell_folder import CellFolder
+    from xrgs.store.inspect import SfmReport
+    from xrgs.store.schema import Identity, Provenance, RecordedCell, Status, Summary
 
 #: What a sweep's record says of each cell.
 RECORD_KEYS = [

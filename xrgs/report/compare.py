@@ -38,8 +38,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from xrgs.experiment.provenance import without_threads
-from xrgs.experiment.store import BASELINE
 from xrgs.report.averages import averaged
 from xrgs.report.collect import ReportError
 from xrgs.report.inference import (
@@ -54,6 +52,8 @@ from xrgs.report.inference import (
     log_ratio,
     share_of_gap,
 )
+from xrgs.store.provenance import without_threads
+from xrgs.store.store import BASELINE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

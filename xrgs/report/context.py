@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from xrgs.capture.degradations import DEGRADATIONS, resolve_degradation
+from xrgs.mixture.degradations import DEGRADATIONS, resolve_degradation
 from xrgs.report.inference import OTHER_CODE
 from xrgs.report.photographs import alike
 from xrgs.report.writing import signed
@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
     from xrgs.config import Conf, VariantConf
-    from xrgs.experiment.schema import Provenance
     from xrgs.report.collect import Sweep
     from xrgs.report.compare import Comparison
+    from xrgs.store.schema import Provenance
 
 #: Scores of fewer views than these say little: one more view may turn their order.
 _ENOUGH_VIEWS = 3

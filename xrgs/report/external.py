@@ -16,24 +16,24 @@ import msgspec
 import pandas as pd
 from msgspec import Meta
 
-from xrgs.capture import variant
-from xrgs.capture.images import ImageError
 from xrgs.evaluation.files import score_file
 from xrgs.evaluation.metrics import VIEW_METRICS
-from xrgs.evaluation.scoring import scoring_code
-from xrgs.experiment.results import over_views
+from xrgs.mixture import variant
+from xrgs.photos.images import ImageError
 from xrgs.report.collect import ReportError, Sweep
 from xrgs.runtime.progress import progress
 from xrgs.safeio.files import is_inside
 from xrgs.safeio.paths import user_path
 from xrgs.safeio.records import read_struct
 from xrgs.safeio.sanitize import for_file_name
+from xrgs.store.results import over_views
+from xrgs.store.scoring import scoring_code
 
 if TYPE_CHECKING:
     from collections.abc import Hashable, Mapping, Sequence
     from pathlib import Path
 
-    from xrgs.capture.views import View
+    from xrgs.mixture.views import View
     from xrgs.report.joined import JoinedStore
 
 #: Another program's renders become one row for each combination of these.

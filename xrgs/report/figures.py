@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import EngFormatter, LogLocator, NullLocator
 
-from xrgs.capture.images import SOFTWARE
+from xrgs.photos.images import SOFTWARE
 from xrgs.report.writing import named
 from xrgs.safeio.sanitize import MAX_CELL, for_line
 

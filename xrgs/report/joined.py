@@ -10,20 +10,20 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from xrgs.capture.description import read_report
-from xrgs.capture.folders import trimmed_folder
 from xrgs.errors import StoreError
-from xrgs.experiment.store import BASELINE
+from xrgs.mixture.paths import trimmed_folder
 from xrgs.report.collect import ReportError
 from xrgs.safeio.sanitize import for_file_name
+from xrgs.store.inspect import read_report
+from xrgs.store.store import BASELINE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from xrgs.capture.description import SfmReport
-    from xrgs.experiment.cell_folder import CellFolder
-    from xrgs.experiment.schema import RecordedCell, SweepRecord
-    from xrgs.experiment.store import Store
+    from xrgs.store.cell_folder import CellFolder
+    from xrgs.store.inspect import SfmReport
+    from xrgs.store.schema import RecordedCell, SweepRecord
+    from xrgs.store.store import Store
 
 _T = TypeVar("_T")
 #: The most ids that the name of a report lists.

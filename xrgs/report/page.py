@@ -8,11 +8,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from xrgs.capture.folders import TO_TRY
 from xrgs.evaluation.metrics import METRICS
-from xrgs.evaluation.scoring import PROTOCOL
-from xrgs.experiment.provenance import MACHINE_KEYS, without_threads
-from xrgs.experiment.store import BASELINE, Store
+from xrgs.mixture.paths import TO_TRY
 from xrgs.report import curves, work
 from xrgs.report.collect import CELL_KEYS, RECORD_KEYS, ReportError, Sweep, read_cells
 from xrgs.report.compare import Design, compare
@@ -29,15 +26,18 @@ from xrgs.report.writing import legend
 from xrgs.runtime.text import TextTable, to_text
 from xrgs.safeio.atomic import write_json, write_text
 from xrgs.safeio.sanitize import counted, for_csv, for_file_name, for_line, for_markdown
+from xrgs.store.provenance import MACHINE_KEYS, without_threads
+from xrgs.store.scoring import PROTOCOL
+from xrgs.store.store import BASELINE, Store
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     import pandas as pd
 
-    from xrgs.experiment.schema import RecordedCell
     from xrgs.report.compare import Comparison
     from xrgs.report.external import External
+    from xrgs.store.schema import RecordedCell
 
 #: The most ablations that are printed with tables of their own; overview and files have all.
 _MAX_PRINTED_ABLATIONS = 6

@@ -14,11 +14,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from xrgs.capture import images
-from xrgs.capture.images import ImageError
 from xrgs.errors import StoreError, UnreadableError
-from xrgs.experiment.store import BASELINE
-from xrgs.experiment.trimming import check_images
+from xrgs.photos import images
+from xrgs.photos.images import ImageError
 from xrgs.report.averages import averaged
 from xrgs.report.compare import is_ratio
 from xrgs.report.context import context_of
@@ -36,6 +34,8 @@ from xrgs.report.writing import (
 from xrgs.runtime.progress import progress
 from xrgs.runtime.text import TextTable, listed
 from xrgs.safeio.sanitize import counted
+from xrgs.store.store import BASELINE
+from xrgs.store.trimming import check_images
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence

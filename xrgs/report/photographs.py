@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from xrgs.capture.description import SfmReport
 from xrgs.errors import StoreError
+from xrgs.store.inspect import SfmReport
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from xrgs.capture import images
-from xrgs.capture.images import ImageError
 from xrgs.errors import StoreError, UnreadableError
-from xrgs.experiment.trimming import check_images
+from xrgs.photos import images
+from xrgs.photos.images import ImageError
 from xrgs.report.collect import ReportError
 from xrgs.report.compare import is_ratio
 from xrgs.report.curves import means_over_runs, means_over_scenes
@@ -32,6 +31,7 @@ from xrgs.report.markup import titled
 from xrgs.runtime.progress import progress
 from xrgs.safeio.atomic import atomic_writer
 from xrgs.safeio.sanitize import for_file_name
+from xrgs.store.trimming import check_images
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence

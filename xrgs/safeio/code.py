@@ -11,12 +11,18 @@ import hashlib
 import io
 import re
 import tokenize
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from xrgs.errors import XrgsError
 
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
 PACKAGE = Path(__file__).parents[1]
+_NAME = "xrgs"
 _SUFFIXES = frozenset({".py", ".cpp", ".h", ".txt"})
 #: Modules that define types alone: an import from them changes no result.
 _TYPING = frozenset({"__future__", "typing", "typing_extensions", "collections.abc", "_typeshed"})
@@ -31,6 +37,88 @@ _CPP = re.compile(
 )
 #: Strings and line comments of CMake.
 _CMAKE = re.compile(r'"(?:\\.|[^"\\])*"|(?P<comment>#[^\n]*)', re.DOTALL)
+
+
+@dataclass(frozen=True)
+class CodeFolders:
+    """Folders whose code decides numbers. It counts always, but for the parts, which are switched.
+
+    A file that only parts import counts with each of them. A file of `folders_of_parts` that
+    nothing imports is no part, and counts for nothing. Files and folders are relative to the
+    package.
+    """
+
+    folders: tuple[str, ...]
+    """The folders."""
+    whole_parts: tuple[str, ...]
+    """Folders below them that are left to the caller: each is a part, or counts for nothing."""
+    folders_of_parts: tuple[str, ...]
+    """Folders below them of which each file is a part, or what a part or the core imports."""
+    parts: frozenset[str]
+    """The files of the parts in these folders."""
+    registries: frozenset[str] = frozenset()
+    """Files that import the parts to list them. They count for nothing."""
+
+    def core(self) -> tuple[str, ...]:
+        """Return the files that count always, sorted."""
+        outside = (*self.whole_parts, *self.folders_of_parts)
+        files = {name for name in _names(*self.folders) if not _is_in(name, outside)}
+        files |= {f"{folder}/__init__.py" for folder in self.folders_of_parts}
+        return tuple(sorted(self._with_imports(files, self.parts) - self.registries))
+
+    def part(self, file: str) -> tuple[str, ...]:
+        """Return the file of a part and those that it needs of `folders_of_parts`, sorted."""
+        others = {*self.core(), *self.registries}
+        return tuple(sorted(self._with_imports({file}, others)))
+
+    def _with_imports(self, files: set[str], end: Iterable[str]) -> set[str]:
+        """Add what files import of `folders_of_parts`, and what that imports, up to an end."""
+        files, pending = set(files), list(files)
+        while pending:
+            found = {n for n in _imported(pending.pop()) if _is_in(n, self.folders_of_parts)}
+            pending += found - files - {*end}
+            files |= found - {*end}
+        return files
+
+
+def _names(*names: str) -> set[str]:
+    return {file.relative_to(PACKAGE).as_posix() for file in sources(*names)}
+
+
+def _is_in(name: str, folders: Iterable[str]) -> bool:
+    return any(name.startswith(f"{folder}/") for folder in folders)
+
+
+def _imported(name: str) -> set[str]:
+    """Return the files of this package that a file imports, for types alone too."""
+    file = PACKAGE / name
+    if file.suffix != ".py":
+        return set()
+    imported = {_file_of(dotted) for dotted in _own_imports(file, file.stat().st_mtime_ns)}
+    return {name for name in imported if name is not None}
+
+
+def _file_of(dotted: str) -> str | None:
+    """Return the file of a module of this package, or the one that defines a name."""
+    parts = dotted.split(".")[1:]
+    for names in (parts, parts[:-1]):
+        module = PACKAGE.joinpath(*names)
+        for file in (module.with_suffix(".py"), module / "__init__.py"):
+            if names and file.is_file():
+                return file.relative_to(PACKAGE).as_posix()
+    return None
+
+
+@cache
+def _own_imports(file: Path, _modified_ns: int) -> frozenset[str]:
+    """Return the dotted names that a file imports from this package."""
+    dotted: set[str] = set()
+    for node in ast.walk(ast.parse(file.read_bytes())):
+        if isinstance(node, ast.Import):
+            dotted.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module is not None:
+            dotted.update(f"{node.module}.{alias.name}" for alias in node.names)
+    return frozenset(name for name in dotted if name.startswith(f"{_NAME}."))
 
 
 def code_digest(*names: str) -> str:

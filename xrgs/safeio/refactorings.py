@@ -15,6 +15,8 @@ from xrgs.safeio.atomic import write_json
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+#: The old digest of a part that was split off from another one; identities of before lack it.
+ABSENT = ""
 #: For each part of the code, old digests by the new ones that are equal.
 FILE = Path(__file__).with_name("refactorings.json")
 

@@ -10,7 +10,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from xrgs.config import GROUPS
 from xrgs.errors import XrgsError
-from xrgs.experiment.store import BASELINE
+from xrgs.store.store import BASELINE
 from xrgs.sweep.axis_values import as_name, parsed
 
 if TYPE_CHECKING:

@@ -13,23 +13,23 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
-from xrgs.capture import folders
 from xrgs.errors import StoreError, XrgsError
-from xrgs.experiment import trimming
-from xrgs.experiment.attempts import remove_cell
-from xrgs.experiment.listing import size_of
+from xrgs.mixture import paths
 from xrgs.runtime import lease
 from xrgs.runtime.text import format_size
 from xrgs.safeio.files import is_name, remove_path
 from xrgs.safeio.records import list_folder
 from xrgs.safeio.sanitize import counted, for_line
+from xrgs.store import trimming
+from xrgs.store.attempts import remove_cell
+from xrgs.store.listing import size_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
     from pathlib import Path
 
-    from xrgs.experiment.listing import CellRow
-    from xrgs.experiment.store import Store
+    from xrgs.store.listing import CellRow
+    from xrgs.store.store import Store
 
 #: What `gc` removes, by the names that choose it.
 GARBAGE = ("old_code", "failed", "aside", "variants")
@@ -153,7 +153,7 @@ def plan_gc(store: Store, cells: Sequence[CellRow], of: Sequence[str]) -> Plan:
     items = [*_removals(store, "cells of old code", old)]
     items += _removals(store, "failed cells", failed)
     if "failed" in of:
-        scenes = [path for path in _paths(store.variants) if folders.is_failed(path.name)]
+        scenes = [path for path in _paths(store.variants) if paths.is_failed(path.name)]
         items += _folders("failed scenes", scenes)
     if "aside" in of:
         for above in (store.cells_folder, store.variants):
@@ -268,7 +268,7 @@ def _orphans(
         return [], ["variants are left alone: the identity of a cell can't be read"]
     orphans, new = [], 0
     for path in _paths(store.variants):
-        if not folders.is_variant(path.name) or folders.id_of(path.name) in used:
+        if not paths.is_variant(path.name) or paths.id_of(path.name) in used:
             continue
         is_new = time.time() - path.stat().st_mtime < _NEW_S
         new += is_new

@@ -6,9 +6,9 @@ import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from xrgs.experiment.store import DEFAULT_STORE
 from xrgs.runtime.text import TextTable, to_text
 from xrgs.safeio.sanitize import counted, for_file_name
+from xrgs.store.store import DEFAULT_STORE
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -25,22 +25,22 @@ from functools import cache
 from statistics import median
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from xrgs.capture import frozen
-from xrgs.capture.degradations import resolve_degradation
-from xrgs.capture.folders import trimmed_folder
 from xrgs.errors import StoreError, XrgsError
-from xrgs.experiment.provenance import processor, this_processor
+from xrgs.mixture import saved_variant
+from xrgs.mixture.degradations import resolve_degradation
+from xrgs.mixture.paths import trimmed_folder
 from xrgs.splat.backend import resolve_backend
 from xrgs.splat.settings import KEPT_BYTES, NOMINAL_STEPS
+from xrgs.store.provenance import processor, this_processor
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from xrgs.capture.frozen import ViewEntry
     from xrgs.config import Conf
-    from xrgs.experiment.cell_folder import CellFolder
-    from xrgs.experiment.store import Store
+    from xrgs.mixture.saved_variant import ViewEntry
+    from xrgs.store.cell_folder import CellFolder
+    from xrgs.store.store import Store
 
 #: Gaussians of a cell for each pixel of its largest view, mean over the steps, where no finished
 #: cell tells.
@@ -248,7 +248,7 @@ def read_views(variants: Path, variant_id: str) -> tuple[ViewEntry, ...]:
     folder = variants / variant_id
     if not folder.is_dir():
         folder = trimmed_folder(variants, variant_id)
-    return frozen.read_manifest(folder).views
+    return saved_variant.read_manifest(folder).views
 
 
 def _sizes(variants: Path, variant_id: str, conf: Conf) -> _Sizes:
@@ -310,7 +310,9 @@ def _render_sizes(views: Sequence[ViewEntry], conf: Conf, step: float) -> Iterat
     most = larger.late_factor if step >= larger.late_from else larger.factor
     blurred = conf.components.formation.widths != "none"
     zoom = conf.variant.factor if resolve_degradation(conf.variant) == "digital_zoom" else 1
-    sizes = Counter((v.width * v.height, min(max(1, round(v.need)), most), v.tag) for v in views)
+    sizes = Counter(
+        (v.width * v.height, min(max(1, round(v.supersampling)), most), v.tag) for v in views
+    )
     for (pixels, factor, tag), count in sizes.items():
         scale = factor / reduced if tag == "HR" else float(factor)
         if tag == "LR" and (factor > 1 or blurred):  # at the size of the pixels that it resolves

@@ -9,17 +9,17 @@ import msgspec
 
 from xrgs.errors import StoreError, XrgsError
 from xrgs.evaluation.metrics import METRICS
-from xrgs.experiment.results import cell_columns, cell_metrics
 from xrgs.runtime.text import TextTable, format_age, format_size, to_text
 from xrgs.safeio.files import walk_files
 from xrgs.safeio.sanitize import MAX_CELL, counted, for_line
+from xrgs.store.results import cell_columns, cell_metrics
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-    from xrgs.experiment.cell_folder import CellFolder
-    from xrgs.experiment.listing import CellRow, SweepRow
-    from xrgs.experiment.store import Store
+    from xrgs.store.cell_folder import CellFolder
+    from xrgs.store.listing import CellRow, SweepRow
+    from xrgs.store.store import Store
 
 #: The most names of scenes or labels that a line lists.
 _MAX_LISTED = 6

@@ -23,13 +23,13 @@ from omegaconf import OmegaConf, flag_override
 
 from xrgs.composing import escape_interpolations
 from xrgs.errors import XrgsError
-from xrgs.experiment.attempts import plan_cell
 from xrgs.runtime import lease
 from xrgs.runtime.machine import gpus, usable_cores
 from xrgs.runtime.progress import log_line
 from xrgs.safeio.paths import user_path
 from xrgs.safeio.sanitize import counted, for_line
 from xrgs.splat.backend import resolve_backend
+from xrgs.store.attempts import plan_cell
 from xrgs.sweep.jobs import worker
 from xrgs.sweep.jobs.job import INTERRUPTED, STOPPED, UNKNOWN
 from xrgs.sweep.plan import expected_length
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from hydra.types import TaskFunction
     from omegaconf import DictConfig
 
-    from xrgs.experiment.store import Store
+    from xrgs.store.store import Store
     from xrgs.sweep.plan import PlannedCell
 
 #: Outcome of a job without an answer; the cell may be launched again.

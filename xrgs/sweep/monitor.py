@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING, Any, Self
 
 from tqdm import tqdm
 
-from xrgs.experiment.cell_folder import CellFolder
 from xrgs.runtime import progress
 from xrgs.runtime.progress import log_line
 from xrgs.runtime.streams import is_terminal
 from xrgs.runtime.text import format_duration
 from xrgs.safeio.files import list_names
 from xrgs.safeio.sanitize import for_line
+from xrgs.store.cell_folder import CellFolder
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence

@@ -5,27 +5,27 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
-from xrgs.capture import scenes
-from xrgs.capture.folders import TO_TRY
 from xrgs.errors import XrgsError
-from xrgs.experiment.cell_folder import CellState
-from xrgs.experiment.identity import cell_id, cell_identity
-from xrgs.experiment.schema import RecordedCell
-from xrgs.experiment.store import BASELINE
+from xrgs.mixture.paths import TO_TRY
+from xrgs.photos import scenes
 from xrgs.runtime.machine import usable_memory
 from xrgs.runtime.text import format_duration, format_size
 from xrgs.safeio.hashing import digest, to_plain
 from xrgs.safeio.sanitize import counted, for_line
 from xrgs.splat.backend import resolve_backend
+from xrgs.store.cell_folder import CellState
+from xrgs.store.identity import cell_id, cell_identity
+from xrgs.store.schema import RecordedCell
+from xrgs.store.store import BASELINE
+from xrgs.sweep.build_variants import how_to_get
 from xrgs.sweep.estimate import TORCH_SLOWDOWN
-from xrgs.sweep.variants import how_to_get
 
 if TYPE_CHECKING:
     from collections.abc import Container, Mapping, Sequence
 
     from xrgs.config import Conf
-    from xrgs.experiment.schema import Identity
-    from xrgs.experiment.store import Store
+    from xrgs.store.schema import Identity
+    from xrgs.store.store import Store
     from xrgs.sweep.axes import CellSpec
     from xrgs.sweep.estimate import Cost, CostEstimator
 

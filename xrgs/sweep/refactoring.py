@@ -15,23 +15,22 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from xrgs.capture import frozen, variant
 from xrgs.errors import StoreError, XrgsError
-from xrgs.evaluation import scoring
-from xrgs.experiment import identity
-from xrgs.experiment.store import Store
+from xrgs.mixture import saved_variant, variant
 from xrgs.runtime.progress import log_line
 from xrgs.safeio import refactorings
-from xrgs.safeio.refactorings import canonical
+from xrgs.safeio.refactorings import ABSENT, canonical
 from xrgs.safeio.sanitize import counted
-from xrgs.sweep import variants
+from xrgs.store import identity, scoring
+from xrgs.store.store import Store
+from xrgs.sweep import build_variants
 from xrgs.sweep.rerun import rerun
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from xrgs.experiment.cell_folder import CellFolder
     from xrgs.safeio.refactorings import Change
+    from xrgs.store.cell_folder import CellFolder
 
 
 @dataclass(frozen=True)
@@ -86,7 +85,8 @@ def prove(store: Store, cells: Sequence[CellFolder], sample: int = 2) -> Proof:
             " it was built with other code (variants of earlier versions don't say)"
         )
     parts = [part for part, _, _ in changes]
-    if several := {part for part in parts if parts.count(part) > 1}:
+    installed = [(part, new) for part, _, new in changes]
+    if several := {part for part, new in installed if installed.count((part, new)) > 1}:
         raise XrgsError(
             f"cells were trained with several versions of {', '.join(sorted(several))}: name cells"
             " of one version"
@@ -102,7 +102,7 @@ def prove(store: Store, cells: Sequence[CellFolder], sample: int = 2) -> Proof:
     refactorings.declare(changes)
     identity.training_code.cache_clear()
     scoring.scoring_code.cache_clear()
-    return Proof(tuple(trained), tuple(built), tuple(parts))
+    return Proof(tuple(trained), tuple(built), tuple(dict.fromkeys(parts)))
 
 
 def _changes(cell: CellFolder) -> list[Change]:
@@ -111,9 +111,10 @@ def _changes(cell: CellFolder) -> list[Change]:
     now, changed = identity.current_code(trained), identity.changed_code(trained)
     if any(part.startswith("plugins/") for part in changed):
         raise XrgsError(f"{cell.id}: a plugin has changed, which is no part of this package")
-    if new := [part for part in changed if part not in trained.code or part not in now]:
-        raise XrgsError(f"{cell.id}: {', '.join(new)} is not in both versions of the code")
-    return [(part, trained.code[part], now[part]) for part in changed] + _changes_of_scores(cell)
+    if gone := [part for part in changed if part not in now]:
+        raise XrgsError(f"{cell.id}: {', '.join(gone)} is not in the installed code")
+    changes = [(part, trained.code.get(part, ABSENT), now[part]) for part in changed]
+    return changes + _changes_of_scores(cell)
 
 
 def _changes_of_scores(cell: CellFolder) -> list[Change]:
@@ -130,10 +131,11 @@ def _changes_of_variant(store: Store, cell: CellFolder) -> list[Change]:
     A variant that is not in the store, or does not say which code has built it, has none.
     """
     try:
-        built = frozen.read_manifest(store.variants / cell.identity().variant).code
+        built = saved_variant.read_manifest(store.variants / cell.identity().variant).code
     except StoreError:
         return []
-    now = variant.code(cell.config().variant)
+    conf = cell.config()
+    now = variant.all_code(conf.scene, conf.variant)
     changes = [(f"variant/{part}", built[part], now[part]) for part in now if part in built]
     return [(part, old, new) for part, old, new in changes if canonical(part, old) != new]
 
@@ -143,8 +145,10 @@ def _build_again(store: Store, variant_id: str, cell: CellFolder) -> None:
     with tempfile.TemporaryDirectory(prefix="xrgs-") as folder:
         other = Store(Path(folder) / "store")
         other.prepare()
-        again = frozen.read_manifest(other.variants / variants.build(cell.config(), other))
-    before = frozen.read_manifest(store.variants / variant_id)
+        again = saved_variant.read_manifest(
+            other.variants / build_variants.build(cell.config(), other)
+        )
+    before = saved_variant.read_manifest(store.variants / variant_id)
     then, now = (msgspec.to_builtins(manifest) for manifest in (before, again))
     different = [
         name for name in then if name not in {"id", "key", "code"} and then[name] != now[name]

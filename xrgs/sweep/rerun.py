@@ -18,17 +18,17 @@ import msgspec
 
 from xrgs import composing
 from xrgs.errors import XrgsError
-from xrgs.experiment import provenance
-from xrgs.experiment.attempts import begin_attempt, plan_cell
-from xrgs.experiment.cell_folder import CellFolder
-from xrgs.experiment.identity import cell_identity
-from xrgs.experiment.store import Store
 from xrgs.runtime.machine import usable_cores
 from xrgs.runtime.progress import log_line
 from xrgs.safeio.hashing import file_digest
 from xrgs.safeio.sanitize import for_line
 from xrgs.splat.backend import resolve_backend
-from xrgs.sweep import variants
+from xrgs.store import provenance
+from xrgs.store.attempts import begin_attempt, plan_cell
+from xrgs.store.cell_folder import CellFolder
+from xrgs.store.identity import cell_identity
+from xrgs.store.store import Store
+from xrgs.sweep import build_variants
 from xrgs.sweep.axes import CellSpec
 from xrgs.sweep.estimate import Cost
 from xrgs.sweep.jobs import worker
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from xrgs.config import Conf
-    from xrgs.experiment.schema import Identity
+    from xrgs.store.schema import Identity
 
 #: Files of results that are compared byte for byte.
 _RESULTS = ("scores.csv", "history.csv", "splats.ply")
@@ -232,13 +232,13 @@ def _provide(variant_id: str, conf: Conf, store: Store) -> None:
         XrgsError: It is not, and building it again gives another variant; or its images were
             removed on purpose, and can't be made again.
     """
-    variants.restore(conf, store, variant_id)
+    build_variants.restore(conf, store, variant_id)
     if (store.variants / variant_id).is_dir():
         return
     log_line(f"variant {variant_id} is not in {store.path} and is built again")
     store.prepare()
     try:
-        built = variants.build(conf, store)
+        built = build_variants.build(conf, store)
     except XrgsError as error:
         raise XrgsError(f"variant {variant_id} is not in {store.path}, and: {error}") from error
     if built == variant_id:
@@ -321,7 +321,7 @@ def _digests(file: Path) -> Iterator[str]:
     """
     yield file_digest(file)
     if file.suffix == ".ply":
-        from xrgs.splat.ply import ANTIALIASED_LINE
+        from xrgs.formats.ply import ANTIALIASED_LINE
 
         yield hashlib.sha256(file.read_bytes().replace(ANTIALIASED_LINE, b"", 1)).hexdigest()
 

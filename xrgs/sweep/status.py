@@ -10,23 +10,23 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, TypeVar
 
-from xrgs.capture.folders import TO_TRY, failed_scenes, is_variant
 from xrgs.errors import StoreError
-from xrgs.experiment.listing import STATES, latest_records
-from xrgs.experiment.store import Store
+from xrgs.mixture.paths import TO_TRY, failed_scenes, is_variant
 from xrgs.runtime import lease, progress
 from xrgs.runtime.streams import is_terminal, redraw, say
 from xrgs.runtime.text import TextTable, format_size, to_text
 from xrgs.safeio.files import file_bytes, is_name
 from xrgs.safeio.records import list_folder
 from xrgs.safeio.sanitize import counted, for_line
+from xrgs.store.listing import STATES, latest_records
+from xrgs.store.store import Store
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
-    from xrgs.experiment.listing import CellRow
-    from xrgs.experiment.schema import RecordedCell
+    from xrgs.store.listing import CellRow
+    from xrgs.store.schema import RecordedCell
 
 _T = TypeVar("_T")
 #: The most cells, scenes or problems that are listed by name under one heading.

@@ -22,13 +22,11 @@ from hydra.errors import CompactHydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from xrgs.capture import scenes
-from xrgs.capture.split import check_variant_conf
 from xrgs.composing import to_conf
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.evaluation.lpips import weights
-from xrgs.experiment.cell_folder import CellState
-from xrgs.experiment.store import Store, StoreGoneError
+from xrgs.mixture.split import check_variant_conf
+from xrgs.photos import scenes
 from xrgs.runtime import lease
 from xrgs.runtime.machine import usable_cores
 from xrgs.runtime.progress import log_line
@@ -37,7 +35,9 @@ from xrgs.safeio.files import is_transient
 from xrgs.safeio.hashing import digest, to_plain
 from xrgs.safeio.sanitize import for_line
 from xrgs.splat.settings import SSIM_WINDOW
-from xrgs.sweep import controls, launch, track, variants
+from xrgs.store.cell_folder import CellState
+from xrgs.store.store import Store, StoreGoneError
+from xrgs.sweep import build_variants, controls, launch, track
 from xrgs.sweep.axes import CellSpec, effective, expand
 from xrgs.sweep.ending import ending
 from xrgs.sweep.estimate import CostEstimator
@@ -322,7 +322,7 @@ class Study:
         """Return the cells with their variants, or with the reasons why there are none."""
         keys = [digest([to_plain(cell.conf.scene), to_plain(cell.conf.variant)]) for cell in plan]
         confs = {key: cell.conf for key, cell in zip(keys, plan, strict=True)}
-        made = variants.plan([*confs.values()], store, allow_build=allow_build)
+        made = build_variants.plan([*confs.values()], store, allow_build=allow_build)
         results = dict(zip(confs, made, strict=True))
         said: dict[str, None] = {}
         cells = []

@@ -13,8 +13,8 @@ from contextlib import suppress
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Self
 
-from xrgs.capture import scenes
 from xrgs.errors import StoreError, UnreadableError, XrgsError
+from xrgs.photos import scenes
 from xrgs.runtime.progress import log_line
 from xrgs.safeio.records import as_number, read_table
 from xrgs.sweep.trackers import SINKS, Run, mlflow_uri
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
-    from xrgs.experiment.cell_folder import CellFolder
-    from xrgs.experiment.store import Store
+    from xrgs.store.cell_folder import CellFolder
+    from xrgs.store.store import Store
     from xrgs.sweep.plan import PlannedCell
     from xrgs.sweep.trackers import Sink
 
@@ -95,7 +95,7 @@ def _table(file: Path, group: str) -> list[tuple[int, dict[str, float]]]:
 
 def _scores(cell: CellFolder) -> tuple[int, dict[str, float]]:
     """Return the number of steps of a finished cell, and its scores."""
-    from xrgs.experiment.results import cell_metrics  # pandas is slow to load
+    from xrgs.store.results import cell_metrics  # pandas is slow to load
 
     summary = cell.summary()
     metrics = cell_metrics(summary, cell.scores())
@@ -104,7 +104,7 @@ def _scores(cell: CellFolder) -> tuple[int, dict[str, float]]:
 
 def run_of(planned: PlannedCell, cell: CellFolder) -> Run:
     """Return how trackers name a planned cell, whose folder has its config."""
-    from xrgs.experiment.results import cell_columns  # pandas is slow to load
+    from xrgs.store.results import cell_columns  # pandas is slow to load
 
     conf, spec = planned.conf, planned.spec
     config = {key: value for key, value in cell_columns(cell, None).items() if "." in key}

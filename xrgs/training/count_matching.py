@@ -23,10 +23,10 @@ from xrgs.training.components.base import Component, Step, check_not_negative
 from xrgs.training.loop import train
 
 if TYPE_CHECKING:
-    from xrgs.capture.dataset import Dataset
     from xrgs.config import Conf
     from xrgs.splat.gaussians import Gaussians
     from xrgs.splat.settings import DensifySettings
+    from xrgs.training.dataset import Dataset
     from xrgs.training.loop import Evaluate
     from xrgs.training.recorder import TrainingResult
 

@@ -32,12 +32,12 @@ if TYPE_CHECKING:
 
     from torch import Tensor
 
-    from xrgs.capture.dataset import Dataset
     from xrgs.config import Conf, SplatConf
     from xrgs.splat.cameras import Camera
     from xrgs.splat.rendering import Render
     from xrgs.splat.strategy.base import Strategy
     from xrgs.training.components import Component, Step, TrainingView
+    from xrgs.training.dataset import Dataset
 
     #: Scores of Gaussians by name; None where one is not available.
     Evaluate = Callable[[Gaussians], Mapping[str, float | None]]

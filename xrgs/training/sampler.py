@@ -15,8 +15,8 @@ from xrgs.training.seeding import seeded_generator
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from xrgs.capture.dataset import LoadedView
     from xrgs.training.checkpoint import State
+    from xrgs.training.dataset import LoadedView
 
 
 GOLDEN = (math.sqrt(5) - 1) / 2

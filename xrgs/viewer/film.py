@@ -13,8 +13,8 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from xrgs.capture.images import write_png
 from xrgs.errors import XrgsError
+from xrgs.photos.images import write_png
 from xrgs.runtime.progress import progress
 from xrgs.safeio.atomic import atomic_writer
 from xrgs.safeio.files import list_names

@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from xrgs.capture.contact_sheet import COLOURS
 from xrgs.errors import XrgsError
 from xrgs.safeio.sanitize import for_markdown
+from xrgs.store.contact_sheet import COLOURS
 from xrgs.viewer.models import reference
 from xrgs.viewer.paths import look_at_point, up_direction
 from xrgs.viewer.splats import to_splats

@@ -9,19 +9,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from xrgs.errors import StoreError, XrgsError
+from xrgs.formats.files import READERS, load_gaussians
 from xrgs.safeio.paths import user_path
 from xrgs.safeio.sanitize import for_line
-from xrgs.splat.files import READERS, load_gaussians
 from xrgs.splat.settings import RasterSettings
 from xrgs.viewer.paths import Poses
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from xrgs.experiment.cell_folder import CellFolder
-    from xrgs.experiment.store import Store
     from xrgs.splat.cameras import Camera
     from xrgs.splat.gaussians import Gaussians
+    from xrgs.store.cell_folder import CellFolder
+    from xrgs.store.store import Store
 
 _log = logging.getLogger(__name__)
 

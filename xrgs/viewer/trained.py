@@ -14,22 +14,22 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from xrgs.capture import dataset
 from xrgs.errors import XrgsError
 from xrgs.splat.attribution import attribute_pixels
 from xrgs.splat.backend import resolve_backend
 from xrgs.splat.rendering import rasterize
 from xrgs.splat.sh import C0
+from xrgs.training import dataset
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from xrgs.capture.dataset import Dataset, LoadedView
-    from xrgs.capture.views import Variant
-    from xrgs.experiment.cell_folder import CellFolder
+    from xrgs.mixture.views import Variant
     from xrgs.splat.cameras import Camera
     from xrgs.splat.gaussians import ActivatedGaussians, Gaussians
     from xrgs.splat.settings import RasterSettings
+    from xrgs.store.cell_folder import CellFolder
+    from xrgs.training.dataset import Dataset, LoadedView
 
     Image = NDArray[np.float32]  # [H, W, 3] 0..1
 

@@ -11,10 +11,10 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from torch import Tensor
 
-from xrgs.capture import images
-from xrgs.capture.scenes.scene import bundled_photograph
 from xrgs.evaluation.lpips.network import MIN_SIDE, distance
 from xrgs.evaluation.lpips.weights import Weights
+from xrgs.photos import images
+from xrgs.photos.scenes.scene import bundled_photograph
 
 Array = NDArray[np.float64]
 

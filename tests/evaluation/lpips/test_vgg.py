@@ -17,9 +17,10 @@ from torch import Tensor
 
 from tests.evaluation.lpips.test_download import sdist
 from tests.evaluation.lpips.test_network import astronaut, blocks, convolve, pair, tensors
-from xrgs.evaluation import metrics, scoring
+from xrgs.evaluation import metrics
 from xrgs.evaluation.lpips import download, vgg
 from xrgs.evaluation.lpips.weights import Weights, WeightsError
+from xrgs.store import scoring
 
 #: Channels of the thirteen layers, fewer than the real ones, and how many convolutions are between
 #: two poolings.

@@ -14,7 +14,7 @@ import pytest
 from xrgs.errors import XrgsError
 from xrgs.evaluation.lpips import download, weights
 from xrgs.evaluation.lpips.weights import Weights, WeightsError
-from xrgs.experiment import provenance
+from xrgs.store import provenance
 
 
 @pytest.fixture

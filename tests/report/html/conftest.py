@@ -14,13 +14,15 @@ import pytest
 import torch
 
 from tests.report.conftest import MadeStore, baseline_config, finish_again
-from xrgs.capture import dataset, frozen, images
-from xrgs.capture.views import Variant, View
-from xrgs.experiment.store import Store
+from xrgs.formats.ply import save_ply
+from xrgs.mixture import saved_variant
+from xrgs.mixture.views import Variant, View
+from xrgs.photos import images
 from xrgs.report import build
 from xrgs.safeio.atomic import write_json
 from xrgs.splat.gaussians import Gaussians
-from xrgs.splat.ply import save_ply
+from xrgs.store.store import Store
+from xrgs.training import dataset
 
 HR, LR = (48, 36), (24, 18)
 TEST_VIEWS = ("IMG_001", "IMG_009")
@@ -67,7 +69,7 @@ def make_variant(store: Store, tags: Mapping[str, str] = TRAINING_VIEWS) -> Vari
     made = Variant(
         "id", folder, "fern", 2, True, tuple(views), points, np.zeros((50, 3), np.uint8), report
     )
-    return frozen.freeze(made, "0123456789abcdef", folder, store.variants, {})
+    return saved_variant.freeze(made, "0123456789abcdef", folder, store.variants, {})
 
 
 def make_gaussians(seed: int, count: int = 200) -> Gaussians:
@@ -149,4 +151,4 @@ def page(pictured: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def cameras(pictured: Path) -> dataset.Dataset:
     """The views of the store's variant in the normalised world."""
     (folder,) = (pictured / "variants").glob("0123*")
-    return dataset.load(frozen.load(folder))
+    return dataset.load(saved_variant.load(folder))

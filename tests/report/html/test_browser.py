@@ -15,12 +15,12 @@ import torch
 from PIL import Image
 
 from tests.report.html.conftest import HOSTILE, data_of
-from xrgs.capture.dataset import Dataset
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import Gaussians
 from xrgs.splat.rendering import rasterize
 from xrgs.splat.settings import RasterSettings
 from xrgs.splat.sh import C0
+from xrgs.training.dataset import Dataset
 from xrgs.viewer.trained import LOG_SCALES
 
 pytestmark = pytest.mark.slow

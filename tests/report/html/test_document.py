@@ -17,12 +17,12 @@ from PIL import Image
 
 from tests.report.conftest import MadeStore, configured
 from tests.report.html.conftest import HOSTILE, HR, data_of, make_gaussians, page_of
-from xrgs.capture import images
-from xrgs.experiment.store import Store
+from xrgs.formats.ply import save_ply
+from xrgs.photos import images
 from xrgs.report import build
 from xrgs.report.html import document
 from xrgs.report.html.images import Album, error_map
-from xrgs.splat.ply import save_ply
+from xrgs.store.store import Store
 
 
 class Parsed(HTMLParser):

@@ -13,15 +13,15 @@ from pathlib import Path
 
 import pytest
 
-from xrgs.capture import variant
-from xrgs.capture.views import Variant
 from xrgs.config import Conf
-from xrgs.experiment.attempts import begin_attempt, plan_cell
-from xrgs.experiment.cell_folder import CellFolder
-from xrgs.experiment.identity import cell_identity
-from xrgs.experiment.store import Store
+from xrgs.mixture import variant
+from xrgs.mixture.views import Variant
 from xrgs.safeio.atomic import write_json
 from xrgs.splat.backend import resolve_backend
+from xrgs.store.attempts import begin_attempt, plan_cell
+from xrgs.store.cell_folder import CellFolder
+from xrgs.store.identity import cell_identity
+from xrgs.store.store import Store
 from xrgs.sweep.jobs import worker
 
 pytestmark = pytest.mark.slow

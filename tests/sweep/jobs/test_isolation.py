@@ -1,7 +1,7 @@
 """Tests of cells that raise, are killed, crash, hang or use all memory, in real sweeps.
 
 The faults come from a `sitecustomize` of these tests, which Python loads in every process: in a
-cell's child it replaces `xrgs.experiment.cell`, and injects a fault into the cells of some seeds.
+cell's child it replaces `xrgs.store.cell`, and injects a fault into the cells of some seeds.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ if "xrgs.sweep.jobs.worker" in sys.orig_argv and "cell" in sys.orig_argv:
     from pathlib import Path
 
     def real():
-        sys.modules.pop("xrgs.experiment.cell", None)
-        return importlib.import_module("xrgs.experiment.cell")
+        sys.modules.pop("xrgs.store.cell", None)
+        return importlib.import_module("xrgs.store.cell")
 
     def raises(*arguments):
         cell = real()
@@ -73,8 +73,8 @@ if "xrgs.sweep.jobs.worker" in sys.orig_argv and "cell" in sys.orig_argv:
         else:
             fault(conf, variant, folder)
 
-    sys.modules["xrgs.experiment.cell"] = types.ModuleType("xrgs.experiment.cell")
-    sys.modules["xrgs.experiment.cell"].run_cell = run_cell
+    sys.modules["xrgs.store.cell"] = types.ModuleType("xrgs.store.cell")
+    sys.modules["xrgs.store.cell"].run_cell = run_cell
 """
 
 

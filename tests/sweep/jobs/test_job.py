@@ -16,14 +16,15 @@ import pytest
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from xrgs.capture import scenes, variant
 from xrgs.cli import sweep as command
 from xrgs.errors import XrgsError
-from xrgs.experiment import identity
-from xrgs.experiment.attempts import begin_attempt
-from xrgs.experiment.store import Store
+from xrgs.mixture import variant
+from xrgs.photos import scenes
 from xrgs.runtime import lease
 from xrgs.safeio.atomic import write_json
+from xrgs.store import identity
+from xrgs.store.attempts import begin_attempt
+from xrgs.store.store import Store
 from xrgs.sweep.jobs import job as job_module
 from xrgs.sweep.jobs import worker
 from xrgs.sweep.jobs.job import (

@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 
 from tests.splat.scenes import noise
-from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.config import ComponentsConf, Conf
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.splat.settings import RasterSettings
 from xrgs.training import components
 from xrgs.training.components import Components, Step
+from xrgs.training.dataset import Dataset, LoadedView
 from xrgs.training.recorder import TrainingRecorder
 from xrgs.training.rendering import StepRenderer
 
@@ -27,7 +27,7 @@ def make_view(tag: str, image: Tensor) -> LoadedView:
     height, width = image.shape[:2]
     K = torch.tensor([[1.2 * width, 0, width / 2], [0, 1.2 * width, height / 2], [0, 0, 1]])
     camera = Camera(torch.eye(4), K, width, height)
-    return LoadedView(tag.lower(), tag, camera, image, need=FACTOR if tag == "LR" else 1)
+    return LoadedView(tag.lower(), tag, camera, image, supersampling=FACTOR if tag == "LR" else 1)
 
 
 def renderer_of(parts: Components) -> StepRenderer:

@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from xrgs.capture.dataset import LoadedView
 from xrgs.config import Conf
 from xrgs.evaluation import protocol
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import Gaussians
 from xrgs.splat.rendering import rasterize_parameters
 from xrgs.splat.settings import RasterSettings
+from xrgs.training.dataset import LoadedView
 
 SIZE = 31
 OPACITY = 0.8

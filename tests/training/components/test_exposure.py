@@ -14,11 +14,11 @@ from torch import Tensor
 from tests.conftest import composed
 from tests.splat.scenes import noise
 from tests.training.components.conftest import make_view, renderer_of
-from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.config import ComponentsConf, ExposureConf
 from xrgs.splat.gaussians import Gaussians
 from xrgs.training.components import Components, Step
 from xrgs.training.components.exposure import Exposure, apply_map
+from xrgs.training.dataset import Dataset, LoadedView
 from xrgs.training.loop import train
 
 Build = Callable[..., Components]

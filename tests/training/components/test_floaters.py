@@ -15,13 +15,13 @@ from torch import Tensor
 from tests.conftest import composed as compose
 from tests.splat.scenes import noise
 from tests.training.conftest import comparable
-from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.config import Conf, FloatersConf
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.splat.settings import DensifySettings
 from xrgs.training.components import Step
 from xrgs.training.components.floaters import Floaters
+from xrgs.training.dataset import Dataset, LoadedView
 from xrgs.training.loop import train
 
 EVERY = 100

@@ -15,13 +15,13 @@ from torch import Tensor
 
 from tests.splat.scenes import noise
 from tests.training.components.conftest import make_view
-from xrgs.capture.dataset import LoadedView
 from xrgs.config import ComponentsConf, FormationConf
 from xrgs.errors import XrgsError
 from xrgs.splat.gaussians import Gaussians
 from xrgs.splat.resample import resize
 from xrgs.training.components import Components, Step
 from xrgs.training.components.formation import BOX, BlurWidths
+from xrgs.training.dataset import LoadedView
 
 Build = Callable[..., Components]
 

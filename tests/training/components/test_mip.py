@@ -11,7 +11,6 @@ from torch import Tensor
 
 from tests.conftest import composed as compose
 from tests.training.conftest import same
-from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.config import ComponentsConf, MipConf
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import ActivatedGaussians, Gaussians, from_points
@@ -21,6 +20,7 @@ from xrgs.splat.settings import DensifySettings, OptimizerSettings, RasterSettin
 from xrgs.splat.strategy.default import DefaultStrategy
 from xrgs.training.components import Components, Step
 from xrgs.training.components.mip import Mip, sampling_rates, smooth
+from xrgs.training.dataset import Dataset, LoadedView
 from xrgs.training.loop import train
 
 NEAR = 0.01

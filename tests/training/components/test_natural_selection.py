@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from tests.conftest import composed as compose
-from xrgs.capture.dataset import Dataset
 from xrgs.config import ComponentsConf
 from xrgs.errors import XrgsError
 from xrgs.splat.gaussians import Gaussians
 from xrgs.training.components import Components, Step
 from xrgs.training.components.natural_selection import NaturalSelection
+from xrgs.training.dataset import Dataset
 from xrgs.training.loop import train
 
 Build = Callable[..., Components]

@@ -17,12 +17,12 @@ from tests.conftest import composed
 from tests.splat.scenes import noise
 from tests.training.components.conftest import make_view
 from tests.training.conftest import same
-from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.config import ComponentsConf, NoiseWeightingConf
 from xrgs.errors import XrgsError
 from xrgs.splat.gaussians import Gaussians
 from xrgs.training.components import Components, Step
 from xrgs.training.components.noise_weighting import NoiseWeighting
+from xrgs.training.dataset import Dataset, LoadedView
 from xrgs.training.loop import train
 
 Build = Callable[..., Components]
@@ -32,7 +32,7 @@ NO_GAUSSIANS = Gaussians(*[torch.empty(0)] * 6)
 def view(name: str, tag: str) -> LoadedView:
     """A black view of 60 x 75 px, or of 12 x 15."""
     size, rho = ((60, 75), 1.0) if tag == "HR" else ((12, 15), 0.2)
-    return replace(make_view(tag, torch.zeros(*size, 3).double()), name=name, rho=rho)
+    return replace(make_view(tag, torch.zeros(*size, 3).double()), name=name, sampling_rate=rho)
 
 
 VIEWS = {

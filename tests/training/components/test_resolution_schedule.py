@@ -14,12 +14,12 @@ from torch.nn.functional import interpolate
 from tests.conftest import composed as compose
 from tests.splat.scenes import noise
 from tests.training.conftest import same
-from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.config import ComponentsConf, Conf
 from xrgs.errors import XrgsError
 from xrgs.splat.gaussians import Gaussians
 from xrgs.training.components import Components, Step, TrainingView
 from xrgs.training.components.resolution_schedule import ResolutionSchedule, kept_shares
+from xrgs.training.dataset import Dataset, LoadedView
 from xrgs.training.loop import train
 
 Build = Callable[..., Components]
@@ -102,7 +102,7 @@ def test_an_hr_view_is_made_smaller_and_shows_the_same(
     point = torch.tensor([0.3, -0.2, 2.0])
     ours, full = ((c.K @ point)[:2] / point[2] for c in (view.camera, hr.view.camera))
     torch.testing.assert_close(ours, full * torch.tensor([38 / 75, 0.5]))
-    assert (view.name, view.tag, view.rho) == (hr.view.name, "HR", hr.view.rho)
+    assert (view.name, view.tag, view.sampling_rate) == (hr.view.name, "HR", hr.view.sampling_rate)
     assert hr.log == {"resolution_schedule.factor": 2}
 
 
@@ -157,7 +157,7 @@ def test_the_start_is_a_training_on_small_photographs(data: Dataset) -> None:
     component = HalvedFirst(conf.components.resolution_schedule, data.train, "auto")
     own = {view.name: view for view in data.train}
     views = component.training_views(own, Step(0, 40, data.train[0])).values()
-    small = tuple(LoadedView(v.name, v.tag, v.camera, v.image, v.rho) for v in views)
+    small = tuple(LoadedView(v.name, v.tag, v.camera, v.image, v.sampling_rate) for v in views)
     assert {v.camera.width < own[v.name].camera.width for v in small if v.tag == "HR"} == {True}
     expected = _after_20_steps(replace(data, train=small), conf)
     assert same(_after_20_steps(data, conf, component), expected)

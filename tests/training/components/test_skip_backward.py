@@ -11,10 +11,10 @@ import torch
 
 from tests.conftest import composed as compose
 from tests.training.conftest import same
-from xrgs.capture.dataset import Dataset
 from xrgs.config import ComponentsConf, Conf
 from xrgs.splat.gaussians import Gaussians
 from xrgs.training.components import Component, Components, Step
+from xrgs.training.dataset import Dataset
 from xrgs.training.loop import train
 
 Build = Callable[..., Components]

@@ -12,12 +12,12 @@ from torch.nn.functional import avg_pool2d, interpolate
 
 from tests.splat.scenes import noise
 from tests.training.components.conftest import make_view
-from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.config import ComponentsConf, Conf
 from xrgs.splat.gaussians import from_points
 from xrgs.splat.rendering import rasterize_parameters
 from xrgs.training import components
 from xrgs.training.components import Components, Step
+from xrgs.training.dataset import Dataset, LoadedView
 from xrgs.training.seeding import seeded_generator
 
 Build = Callable[..., Components]
@@ -114,7 +114,7 @@ def test_a_view_is_rendered_larger_by_its_need_and_not_by_its_tag(
     on: ComponentsConf, baseline: Conf, tag: str, need: float, early: int, late: int
 ) -> None:
     on.supersampled.late_factor, on.supersampled.late_from = 5, 15_000
-    view = replace(make_view(tag, noise(12, 15, 1)), need=need)
+    view = replace(make_view(tag, noise(12, 15, 1)), supersampling=need)
     parts = _built(on, baseline, "none", view)
     for number, factor in ((0, early), (15_000, late)):
         step = Step(number, 30_000, view)
@@ -132,7 +132,7 @@ def test_a_coarse_hr_view_beside_degraded_ones_averages_over_its_pixels(
     on: ComponentsConf, baseline: Conf
 ) -> None:
     """No kernel of the variant has made it; nor does it resolve less than its pixels."""
-    view = replace(make_view("HR", noise(12, 15, 1)), need=2.0)
+    view = replace(make_view("HR", noise(12, 15, 1)), supersampling=2.0)
     for degradation in ("downsample", "digital_zoom"):
         parts, step = _built(on, baseline, degradation, view), Step(0, 1, view)
         assert parts.render_camera(view.camera, step).width == 30
@@ -143,7 +143,7 @@ def test_a_coarse_hr_view_beside_degraded_ones_averages_over_its_pixels(
 
 def test_compressed_views_have_nothing_to_supersample(on: ComponentsConf, baseline: Conf) -> None:
     """They have all the pixels of an HR view, and so its need."""
-    view = replace(make_view("LR", torch.zeros(60, 75, 3)), need=1.0)
+    view = replace(make_view("LR", torch.zeros(60, 75, 3)), supersampling=1.0)
     parts, step = _built(on, baseline, "jpeg", view), Step(0, 1, view)
     assert parts.render_camera(view.camera, step) is view.camera
 
@@ -152,7 +152,7 @@ def test_a_reduced_view_is_rendered_larger_than_its_reduced_photograph(
     on: ComponentsConf, baseline: Conf
 ) -> None:
     on.resolution_schedule.start_share = 0.01
-    view = replace(make_view("HR", noise(60, 75, 1).float()), need=2.0)
+    view = replace(make_view("HR", noise(60, 75, 1).float()), supersampling=2.0)
     parts = _built(on, baseline, "none", view)
     step = Step(0, 30_000, view)
     (small,) = parts.training_views({"hr": view}, step).values()
@@ -170,7 +170,7 @@ def test_the_number_of_views_with_each_factor_is_logged(
     caplog.set_level("INFO")
     needs = (1.0, 1.2, 2.0, 4.8)
     views = [
-        replace(make_view("LR", torch.zeros(12, 15, 3)), name=f"{need}", need=need)
+        replace(make_view("LR", torch.zeros(12, 15, 3)), name=f"{need}", supersampling=need)
         for need in needs
     ]
     _built(on, baseline, "none", *views)

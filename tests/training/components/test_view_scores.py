@@ -14,7 +14,6 @@ from torch import Tensor
 from tests.conftest import composed as compose
 from tests.splat.scenes import noise
 from tests.training.components.conftest import renderer_of
-from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.config import ComponentsConf
 from xrgs.splat.attribution import attribute_pixels
 from xrgs.splat.gaussians import ActivatedGaussians, Gaussians
@@ -22,6 +21,7 @@ from xrgs.splat.rendering import rasterize_parameters
 from xrgs.splat.settings import RasterSettings
 from xrgs.training.components import Component, Components, Step
 from xrgs.training.components.view_scores import ErrorScore, edges
+from xrgs.training.dataset import Dataset, LoadedView
 from xrgs.training.loop import train
 
 Build = Callable[..., Components]
@@ -31,7 +31,7 @@ Scores = Callable[..., Tensor]
 @pytest.fixture
 def fine(views: dict[str, LoadedView]) -> list[LoadedView]:
     """The HR view, and the LR view with its sampling rate."""
-    return [views["HR"], replace(views["LR"], rho=0.2)]
+    return [views["HR"], replace(views["LR"], sampling_rate=0.2)]
 
 
 def ready(parts: Components) -> Components:

@@ -14,7 +14,6 @@ from torch import Tensor
 
 from tests.splat.scenes import noise
 from tests.training.components.conftest import make_view
-from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.config import ComponentsConf, Conf
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import Gaussians
@@ -28,6 +27,7 @@ from xrgs.training.components.weighting import (
     region_attenuations,
     scheduled_attenuation,
 )
+from xrgs.training.dataset import Dataset, LoadedView
 
 Build = Callable[..., Components]
 
@@ -169,7 +169,7 @@ def test_the_weight_is_a_power_of_the_rate_whatever_the_tag(
 ) -> None:
     off.continuous_weighting.gamma = 0.86
     off.loss_weighting.lr_weight = 0.5  # not read
-    view = dataclasses.replace(VIEW, rho=rho, tag=tag)
+    view = dataclasses.replace(VIEW, sampling_rate=rho, tag=tag)
     assert weight(build(off, view), view) == pytest.approx(expected, rel=1e-3)
 
 

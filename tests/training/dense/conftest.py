@@ -10,10 +10,10 @@ import torch
 from numpy.typing import NDArray
 from torch.nn.functional import avg_pool2d
 
-from xrgs.capture.dataset import Dataset, LoadedView
-from xrgs.capture.scenes import procedural, raycast, still_life
+from xrgs.photos.scenes import procedural, raycast, still_life
 from xrgs.splat.cameras import Camera
 from xrgs.splat.normalize import normalize_scene
+from xrgs.training.dataset import Dataset, LoadedView
 from xrgs.training.dense.levels import Level
 
 Array = NDArray[np.float64]
@@ -86,7 +86,11 @@ def true_scene(count: int, width: int) -> TrueScene:
         camera = full.resized(small.shape[1], small.shape[0])
         pixels = (small * 255).round().to(torch.uint8)
         tag = "HR" if shrink == 1 else "LR"
-        views.append(LoadedView(f"v{number}", tag, camera, pixels, rho=1 / shrink, need=shrink))
+        views.append(
+            LoadedView(
+                f"v{number}", tag, camera, pixels, sampling_rate=1 / shrink, supersampling=shrink
+            )
+        )
     points_of_scene = torch.from_numpy(world.points).float()
     data = Dataset(
         tuple(views), tuple(views[:1]), points_of_scene, colors, world.scene_scale, FACTOR

@@ -12,12 +12,12 @@ import torch
 from tests.conftest import composed as compose
 from tests.training.conftest import comparable, same
 from tests.training.dense.conftest import TrueScene
-from xrgs.capture.dataset import Dataset
 from xrgs.config import Conf
-from xrgs.experiment import identity
 from xrgs.splat.gaussians import Gaussians, from_points
+from xrgs.store import identity
 from xrgs.training import dense
 from xrgs.training.checkpoint import Checkpoint
+from xrgs.training.dataset import Dataset
 from xrgs.training.loop import train
 
 

@@ -9,9 +9,9 @@ import tempfile
 import zlib
 from pathlib import Path
 
-from xrgs.capture.download.http import download, is_url
 from xrgs.errors import XrgsError
 from xrgs.evaluation.lpips import vgg, weights
+from xrgs.photos.download.http import download, is_url
 from xrgs.safeio.atomic import atomic_writer
 from xrgs.safeio.files import read_bytes
 from xrgs.safeio.paths import user_path

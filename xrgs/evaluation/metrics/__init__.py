@@ -2,7 +2,7 @@
 
 To add a score of views, add a file with its function, and an entry to `METRICS`; `xrgs-store
 rescore` then computes it for cells that are done. Any other entry is a figure of the cell's
-summary, or follows from the PSNR of its views (`xrgs.experiment.results.over_views`). torch and
+summary, or follows from the PSNR of its views (`xrgs.store.results.over_views`). torch and
 kornia are imported where they are used, because plans and reports are made without them.
 """
 
@@ -39,25 +39,15 @@ __all__ = [
     "ssim",
 ]
 
-_BASE = ("evaluation/metrics/base.py", "capture/masks.py")
-_PSNR = (*_BASE, "evaluation/metrics/psnr.py")
-_SSIM = (*_BASE, "evaluation/metrics/ssim.py")
-_LPIPS = (
-    *_BASE,
-    "evaluation/metrics/lpips.py",
-    "evaluation/lpips/network.py",
-    "evaluation/lpips/weights.py",
-)
-
 METRICS = (
     Metric("training_time_s", "Training time", "s", higher_is_better=False),
     Metric("render_time_ms", "Render time", "ms", higher_is_better=False),
     Metric("gaussians", "Gaussians", "", higher_is_better=False),
     Metric("memory_bytes", "Memory", "bytes", higher_is_better=False),
     Metric("peak_rss_bytes", "Peak RSS", "bytes", higher_is_better=False),
-    Metric("lpips", "LPIPS", "", higher_is_better=False, score=lpips, sources=_LPIPS),
-    Metric("ssim", "SSIM", "", higher_is_better=True, score=ssim, sources=_SSIM),
-    Metric("psnr", "PSNR", "dB", higher_is_better=True, score=psnr, sources=_PSNR),
+    Metric("lpips", "LPIPS", "", higher_is_better=False, score=lpips),
+    Metric("ssim", "SSIM", "", higher_is_better=True, score=ssim),
+    Metric("psnr", "PSNR", "dB", higher_is_better=True, score=psnr),
     Metric("psnr_pooled", "PSNR (pooled)", "dB", higher_is_better=True),
     Metric("psnr_worst", "PSNR (worst view)", "dB", higher_is_better=True),
     Metric(
@@ -66,7 +56,6 @@ METRICS = (
         "dB",
         higher_is_better=True,
         score=psnr_plain,
-        sources=_PSNR,
         optional=True,
     ),
     Metric(
@@ -75,7 +64,6 @@ METRICS = (
         "dB",
         higher_is_better=True,
         score=psnr_fitted,
-        sources=(*_PSNR, "evaluation/metrics/psnr_fitted.py"),
         optional=True,
     ),
     Metric(
@@ -84,11 +72,6 @@ METRICS = (
         "",
         higher_is_better=False,
         score=lpips_vgg,
-        sources=(
-            *_LPIPS,
-            "evaluation/metrics/lpips_vgg.py",
-            "evaluation/lpips/vgg.py",
-        ),
         optional=True,
     ),
     Metric("evaluations", "Alpha evaluations", "", higher_is_better=False),

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from xrgs.capture import masks
+from xrgs.photos import masks
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -26,8 +26,6 @@ class Metric:
     score: Callable[[Tensor, Tensor, Tensor | None], float | None] | None = None
     """The function that scores a render and its photograph, both [H, W, 3] in 0..1, inside a mask
     [H, W] bool, True for a pixel that is used, or None; None for a figure of the whole cell."""
-    sources: tuple[str, ...] = ()
-    """The source files of a score, relative to the package: a change in them makes scores stale."""
     optional: bool = False
     """Whether it applies to some views alone. It is a row only of tables in which a cell has it."""
 

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
     from pathlib import Path
 
-    from xrgs.capture.views import Variant
     from xrgs.evaluation.metrics import Metric
+    from xrgs.mixture.views import Variant
     from xrgs.report.collect import Sweep
     from xrgs.report.compare import Comparison
     from xrgs.report.context import Context

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from xrgs.capture import variant
 from xrgs.errors import XrgsError
 from xrgs.evaluation.metrics import METRICS, VIEW_METRICS
+from xrgs.mixture import variant
 from xrgs.report.html.content import (
     Content,
     add_curves,
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
-    from xrgs.capture.views import Variant
+    from xrgs.mixture.views import Variant
     from xrgs.report.collect import Sweep
     from xrgs.report.joined import JoinedStore
     from xrgs.report.tables import Tables

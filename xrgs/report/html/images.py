@@ -16,10 +16,10 @@ import numpy as np
 from matplotlib import colormaps
 from PIL import Image
 
-from xrgs.capture import images
-from xrgs.capture.images import ImageError
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.evaluation.metrics import VIEW_METRICS
+from xrgs.photos import images
+from xrgs.photos.images import ImageError
 from xrgs.report.html.content import finite, run_names, runs, shown, why
 from xrgs.runtime.progress import progress
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from numpy.typing import NDArray
 
-    from xrgs.capture.views import Variant
+    from xrgs.mixture.views import Variant
     from xrgs.report.compare import Comparison
     from xrgs.report.html.content import Content
     from xrgs.report.joined import JoinedStore

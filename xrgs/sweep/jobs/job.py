@@ -12,14 +12,14 @@ from itertools import cycle
 from typing import TYPE_CHECKING
 
 from xrgs.errors import StoreError, UnreadableError, XrgsError
-from xrgs.experiment.attempts import begin_attempt
-from xrgs.experiment.identity import changed_code
 from xrgs.runtime import lease
 from xrgs.runtime.machine import gpus
 from xrgs.runtime.progress import log_line
 from xrgs.safeio.files import is_transient
 from xrgs.splat.backend import arithmetic
-from xrgs.sweep import variants
+from xrgs.store.attempts import begin_attempt
+from xrgs.store.identity import changed_code
+from xrgs.sweep import build_variants
 from xrgs.sweep.jobs import worker
 from xrgs.sweep.jobs.supervise import Limits
 
@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from xrgs.config import Conf
-    from xrgs.experiment.cell_folder import CellFolder
-    from xrgs.experiment.schema import Identity
-    from xrgs.experiment.store import Store
+    from xrgs.store.cell_folder import CellFolder
+    from xrgs.store.schema import Identity
+    from xrgs.store.store import Store
     from xrgs.sweep.session import SweepSession
 
 #: Outcomes of a job other than the states of a cell. LOCKED: another sweep is training the cell.
@@ -124,7 +124,7 @@ def _run_under_lease(
     # images of a trimmed variant are made again here.
     variant = store.variants / identity.variant
     if not variant.is_dir():
-        variants.restore(conf, store, identity.variant)
+        build_variants.restore(conf, store, identity.variant)
     if not variant.is_dir():
         raise XrgsError(f"{name}: its variant {variant} is missing")
     held = lease.acquire(store.leases, cell.id)

@@ -22,19 +22,19 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from xrgs.errors import UnreadableError, XrgsError
-from xrgs.experiment.cell_folder import LOG
 from xrgs.runtime import processes
 from xrgs.runtime.machine import set_portable_blas
 from xrgs.runtime.signals import StopRequest, StopSignal, end_by_sigterm, handlers_kept
 from xrgs.runtime.streams import guard_streams, log_to_stderr, say
 from xrgs.safeio.atomic import write_json
 from xrgs.safeio.records import read_struct
+from xrgs.store.cell_folder import LOG
 from xrgs.sweep.jobs import supervise
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from xrgs.experiment.cell_folder import CellFolder
+    from xrgs.store.cell_folder import CellFolder
 
 #: The message when the store can't be written any more.
 NOTHING_LOST = (
@@ -172,9 +172,9 @@ def _death(code: int) -> WorkerError:
 
 def _build_variant(request: Mapping[str, Any]) -> dict[str, Any]:
     with handlers_kept():  # of all modules that import pycolmap, not of `sfm` alone
-        from xrgs.capture import sfm, variant  # noqa: F401
+        from xrgs.mixture import sfm, variant  # noqa: F401
     from xrgs.composing import from_dict
-    from xrgs.experiment.store import Store
+    from xrgs.store.store import Store
 
     log_to_stderr()
     conf, store = from_dict(request["conf"]), Store(Path(request["store"]))
@@ -184,8 +184,8 @@ def _build_variant(request: Mapping[str, Any]) -> dict[str, Any]:
 
 def _restore_variant(request: Mapping[str, Any]) -> dict[str, Any]:
     from xrgs.composing import from_dict
-    from xrgs.experiment.store import Store
-    from xrgs.experiment.trimming import restore_variant
+    from xrgs.store.store import Store
+    from xrgs.store.trimming import restore_variant
 
     log_to_stderr()
     conf, store = from_dict(request["conf"]), Store(Path(request["store"]))
@@ -195,9 +195,9 @@ def _restore_variant(request: Mapping[str, Any]) -> dict[str, Any]:
 
 def _run_cell(request: Mapping[str, Any]) -> dict[str, Any]:
     _enter_folder(Path(request["cell"]), request["inode"])
-    from xrgs.capture import variant
-    from xrgs.experiment import cell
-    from xrgs.experiment.cell_folder import CellFolder
+    from xrgs.mixture import variant
+    from xrgs.store import cell
+    from xrgs.store.cell_folder import CellFolder
 
     stop = StopRequest()
     stop.watch()
@@ -234,7 +234,7 @@ def _enter_folder(folder: Path, inode: int) -> None:
 
 
 def _store_is_gone(request: Mapping[str, Any]) -> bool:
-    from xrgs.experiment.store import Store
+    from xrgs.store.store import Store
 
     return "store" in request and Store(Path(request["store"])).is_gone
 

@@ -4,8 +4,8 @@ A component that is off is not even imported, so that the baseline executes none
 the paper leaves open is fixed in the docstrings of the components, under "our choice where the
 paper is silent".
 
-`xrgs.training.registry` lists the components. A component of another package is not in it:
-`xrgs.training.plugins` finds it by its entry point. CONTRIBUTING.md says how to write either kind.
+`xrgs.registry` lists the components. A component of another package is not in it:
+`xrgs.plugins` finds it by its entry point. CONTRIBUTING.md says how to write either kind.
 """
 
 from __future__ import annotations
@@ -13,9 +13,10 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from xrgs import plugins
 from xrgs.config import is_on
 from xrgs.errors import XrgsError
-from xrgs.training import plugins
+from xrgs.registry import BUILT_IN, ComponentEntry
 from xrgs.training.components.base import (
     Component,
     Step,
@@ -25,13 +26,12 @@ from xrgs.training.components.base import (
     check_not_negative,
 )
 from xrgs.training.components.combined import Components
-from xrgs.training.registry import BUILT_IN, ComponentEntry
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from xrgs.capture.dataset import Dataset
     from xrgs.config import ComponentsConf, SplatConf
+    from xrgs.training.dataset import Dataset
 
 __all__ = [
     "Component",

@@ -41,12 +41,12 @@ if TYPE_CHECKING:
 
     from torch import Tensor
 
-    from xrgs.capture.dataset import Dataset
     from xrgs.config import ComponentsConf, SplatConf
     from xrgs.splat.cameras import Camera
     from xrgs.splat.gaussians import ActivatedGaussians, Gaussians
     from xrgs.splat.settings import DensifySettings
     from xrgs.splat.strategy.refinement import Groups
+    from xrgs.training.dataset import Dataset
 
 
 class TrainingView(Protocol):
@@ -61,11 +61,11 @@ class TrainingView(Protocol):
         """The resolution class of the view, `HR` or `LR`."""
 
     @property
-    def rho(self) -> float:
+    def sampling_rate(self) -> float:
         """The sampling rate of the view over the highest rate of all views, in (0, 1]."""
 
     @property
-    def need(self) -> float:
+    def supersampling(self) -> float:
         """How many times as many px a side the view needs to be as fine as the finest views."""
 
     @property

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from xrgs.config import NaturalSelectionConf
     from xrgs.splat.gaussians import Gaussians
 
-_LOGIT_OF_DEATH = math.log(0.001 / 0.999)
+_LOWEST_LIVE_LOGIT = math.log(0.001 / 0.999)
 """Gaussians with an opacity below 0.001 are removed [deng2025gns]."""
 _ADJUST_EVERY = 100
 """Steps of a 30,000-step run between two adjustments of the push [deng2025gns]."""
@@ -141,7 +141,7 @@ class NaturalSelection(Component):
         logits = gaussians.opacities.detach()
         lowest = torch.zeros_like(logits, dtype=torch.bool)
         lowest[torch.argsort(logits, stable=True)[:excess]] = True
-        return lowest if self.done else lowest & (logits < _LOGIT_OF_DEATH)
+        return lowest if self.done else lowest & (logits < _LOWEST_LIVE_LOGIT)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the push, the start of the path, and whether the budget has been met."""

@@ -91,11 +91,11 @@ class NoiseWeighting(Component):
             )
         self.settings = settings
         self.backend = backend
-        lowest = min(view.rho for view in views)
+        lowest = min(view.sampling_rate for view in views)
         self.sizes = {
             view.name: (
-                max(1, round(view.camera.height * lowest / view.rho)),
-                max(1, round(view.camera.width * lowest / view.rho)),
+                max(1, round(view.camera.height * lowest / view.sampling_rate)),
+                max(1, round(view.camera.width * lowest / view.sampling_rate)),
             )
             for view in views
         }

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Self
 import torch
 from torch import Tensor
 
-from xrgs.capture import masks
 from xrgs.errors import XrgsError
+from xrgs.photos import masks
 from xrgs.splat.cameras import Camera
 from xrgs.splat.loss import WINDOW
 from xrgs.splat.resample import resize
@@ -29,13 +29,13 @@ class _ReducedView:
 
     name: str
     tag: str
-    rho: float
+    sampling_rate: float
     camera: Camera
     image: Tensor
     """[h, w, 3] at the camera's size."""
     mask: Tensor | None
     """[h, w] bool, True for a pixel that is used; None uses all."""
-    need: float
+    supersampling: float
     """The need of the view with all its pixels."""
 
 
@@ -156,7 +156,9 @@ class ResolutionSchedule(Component):
         if view.mask is not None:
             resized = masks.resized(view.mask.cpu().numpy(), width, height)
             mask = torch.from_numpy(resized).to(view.mask.device)
-        return _ReducedView(view.name, view.tag, view.rho, camera, image, mask, view.need)
+        return _ReducedView(
+            view.name, view.tag, view.sampling_rate, camera, image, mask, view.supersampling
+        )
 
 
 def kept_shares(images: Iterable[Tensor], factors: Iterable[int]) -> dict[int, float]:

@@ -40,9 +40,10 @@ class Supersampled(Component):
         loss = L(D(render_k), I),    k_v = clamp(round(need_v), 1, factor)
 
     is the loss of the view. need_v says how many times as many pixels a side the view would need to
-    be as fine as the finest views of what it sees (`xrgs.capture.sampling.needed_factors`): about 1
-    for an HR view, which stays as it is, and about `variant.factor` for a degraded one. The view's
-    tag does not count: photographs that are hardly a mixture are all rendered at their own size.
+    be as fine as the finest views of what it sees (`xrgs.mixture.sampling_rate.needed_factors`):
+    about 1 for an HR view, which stays as it is, and about `variant.factor` for a degraded one. The
+    view's tag does not count: photographs that are hardly a mixture are all rendered at their own
+    size.
 
     D is the kernel by which the variant has made its LR views:
 
@@ -92,7 +93,7 @@ class Supersampled(Component):
         self.zoom = zoom if degradation == "digital_zoom" else 1
         low = [view for view in views if view.tag == "LR"]
         self.blur = BlurWidths(blur, low) if blur.widths != "none" else None
-        self._log_factors([view.need for view in views])
+        self._log_factors([view.supersampling for view in views])
 
     @classmethod
     def from_settings(cls, settings: SupersampledConf, setup: TrainingSetup) -> Self | None:
@@ -163,7 +164,7 @@ class Supersampled(Component):
         """Return k at a step on a view."""
         late = step.nominal >= self.settings.late_from
         settings = self.settings
-        return _clamped(step.view.need, settings.late_factor if late else settings.factor)
+        return _clamped(step.view.supersampling, settings.late_factor if late else settings.factor)
 
     def _is_blurred(self, step: Step) -> bool:
         return self.blur is not None and step.view.tag == "LR"

@@ -73,8 +73,8 @@ class MultiviewScore(_ViewScores):
     pixels. A sum of weights needs no kernel of its own, and a Gaussian that is faint or hidden in a
     pixel does not answer for its error. The sum is a few hundredths of the count, so that `pixels`
     is another number than 5. rho is the sampling rate of the view relative to the finest view
-    (`TrainingView.rho`), so that the sum is in px^2 of the finest view: a pixel of an LR view that
-    is 5 times smaller counts 25.
+    (`TrainingView.sampling_rate`), so that the sum is in px^2 of the finest view: a pixel of an LR
+    view that is 5 times smaller counts 25.
 
     FastGS's pruning is left out. Four times after densification it removes Gaussians with an
     opacity below 0.1, and those with more than 0.9 of the largest sum of such scores, each times
@@ -112,7 +112,7 @@ class MultiviewScore(_ViewScores):
         error = _mean_error(self.renderer.photograph(gaussians, step), step.view.image)
         high = _in_unit_range(error, step.view.mask) > self.error
         sums = self.renderer.attribute(high.to(error), gaussians, step)
-        return sums / step.view.rho**2
+        return sums / step.view.sampling_rate**2
 
 
 class ErrorScore(_ViewScores):

@@ -205,7 +205,7 @@ def weight_by_sampling_rate(view: TrainingView, gamma: float) -> float:
         view: The view.
         gamma: The power.
     """
-    return float(view.rho**gamma)
+    return float(view.sampling_rate**gamma)
 
 
 def scene_attenuation(views: Sequence[TrainingView], texture: float) -> float:

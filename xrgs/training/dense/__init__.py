@@ -34,7 +34,7 @@ from xrgs.training.dense.levels import swept_views
 from xrgs.training.dense.surface import Squares, cover, find_depths, share_covered, share_good
 
 if TYPE_CHECKING:
-    from xrgs.capture.dataset import Dataset
+    from xrgs.training.dataset import Dataset
 
 BUDGET = 0.25
 """The most Gaussians, for each pixel of the largest training view: 48,000 at 504 x 378 px; our

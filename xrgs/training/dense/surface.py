@@ -66,7 +66,7 @@ def cover(maps: Sequence[DepthMap], budget: int) -> Squares:
         maps: The depths of the views, with at least one good pixel among them.
         budget: The most squares, unless the largest squares of the quadtrees are more.
     """
-    ordered = sorted(maps, key=lambda each: -each.view.photograph.rho)
+    ordered = sorted(maps, key=lambda each: -each.view.photograph.sampling_rate)
     of_views = zip(ordered, owned(ordered), strict=True)
     having = [(each, pixels) for each, pixels in of_views if pixels.any()]
     focal = [each.view.photograph.camera.numbers.intrinsics[0] for each, _ in having]

@@ -1,0 +1,337 @@
+"""Tests of Hydra's overrides on a command line: paths with any character, and typos."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+from omegaconf.errors import ConfigKeyError
+
+from xrgs import config
+from xrgs.cli.overrides import explained, with_options_first, with_quotes
+from xrgs.cli.sweep import texts
+from xrgs.errors import XrgsError
+from xrgs.photos.scenes import motorcycle
+from xrgs.sweep.axes import expand
+
+RunCommand = Callable[..., tuple[int, str, str]]
+ACCENT = "e\N{COMBINING ACUTE ACCENT}"
+WHOLE = "\N{LATIN SMALL LETTER E WITH ACUTE}"
+ODD = (
+    *("a b", " lead", "trail ", "-x", "~nobody", "50%", "a=b", "it's", 'q"q', "a;b", "a&b", "#h"),
+    *("!x", "[x]", "{y}", "(p)", "$x", "a:b", "*", ACCENT, WHOLE, "部屋", "🙂", "1e3", "true"),
+    *("007", "a\\b'"),
+)
+
+
+def parsed(word: str) -> object:
+    """Return what Hydra reads from a word that was given quotes."""
+    (override,) = OverridesParser.create().parse_overrides(with_quotes([word]))
+    return override.value()
+
+
+@pytest.mark.parametrize("name", ODD)
+def test_hydra_reads_a_path_as_it_was_written(name: str) -> None:
+    found = parsed(f"scene.path={name}")
+    assert getattr(found, "text", found) == name
+    assert texts([f"store={name}"]).store == name
+
+
+@pytest.mark.parametrize("name", ["a,b", "null", "${y}", "a\\b", f"{WHOLE},b"])
+def test_a_word_that_hydra_reads_otherwise_is_a_path_if_it_exists(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compose: Callable[..., config.Conf]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / name).mkdir()
+    assert compose(*with_quotes([f"scene.path={name}"])).scene.path == name
+
+
+@pytest.mark.parametrize("name", [*ODD, "100_7100", "null", "it's, that's", "${y}", "IMG(1)", "+p"])
+def test_names_of_views_are_read_as_they_were_written(
+    name: str, compose: Callable[..., config.Conf]
+) -> None:
+    name = name.strip()
+    if "," not in name:
+        for value in (f"[{name}]", f"[IMG_1, {name}]", f"IMG_1,{name}"):
+            given = compose(*with_quotes([f"variant.test={value}"])).variant.test
+            assert given == [*["IMG_1"] * ("IMG_1" in value), name]
+    assert compose(*with_quotes([f"scene.name={name}"])).scene.name == name
+
+
+@pytest.mark.parametrize(
+    ("value", "lists"),
+    [
+        ("[]", [[]]),
+        ("[a,b],[c]", [["a", "b"], ["c"]]),
+        ("['a,b',\"c\"]", [["a,b", "c"]]),
+        ("[IMG(1,2),x]", [["IMG(1,2)", "x"]]),
+        ("[IMG[1,x]", [["IMG[1", "x"]]),
+        ("[it's,that's]", [["it's", "that's"]]),
+    ],
+)
+def test_lists_of_names_are_lists_and_axes(value: str, lists: list[list[str]]) -> None:
+    specs = expand(with_quotes([f"variant.test={value}"]))
+    found = [OverridesParser.create().parse_override(*spec.overrides).value() for spec in specs]
+    assert found == lists
+
+
+def test_files_of_groups_may_have_any_name(tmp_path: Path, sweep_here: RunCommand) -> None:
+    (tmp_path / "scene").mkdir()
+    for name in ("é (1)", "a=b"):
+        (tmp_path / "scene" / f"{name}.yaml").write_text("name: x\nkind: motorcycle\n")
+    code, _, err = sweep_here(
+        f"--config-dir={tmp_path}", "scene=é (1),a=b", "dry_run=true", "variant.test_every=0"
+    )
+    assert code == 0, err
+    assert "plan: 2 cells" in err
+
+
+def test_a_folder_in_place_of_a_scene_is_answered_with_the_words_to_type(
+    tmp_path: Path, sweep_here: RunCommand
+) -> None:
+    (tmp_path / "my photos").mkdir()
+    code, _, err = sweep_here(f"scene={tmp_path}/my photos", "dry_run=true")
+    assert code == 1
+    assert f"is given as scene=folder 'scene.path={tmp_path}/my photos'" in err
+
+
+def test_lists_quotes_and_other_keys_stay_as_they_are() -> None:
+    words = ["scene.path=a,b", "scene.path='é'", "seed=range(0,9)", "label=é", "+ablation=[a,b]"]
+    assert with_quotes(words) == words
+    assert with_quotes(["scene.path=é,b c"]) == ["scene.path='é',b c"]
+    assert with_quotes(["store=é,b c"]) == ["store='é,b c'"]
+
+
+@pytest.mark.parametrize(
+    ("written", "given"),
+    [
+        ("seed=0,1", "--multirun seed=0,1"),
+        ("seed=0 -m +ablation=mip", "--multirun seed=0 +ablation=mip"),
+        ("seed=0 --multirun", "--multirun seed=0"),
+        ("seed=0 --config-dir my ~x", "--config-dir my --multirun seed=0 ~x"),
+        ("seed=0 -cd=my=1 scene=a", "-cd my=1 --multirun seed=0 scene=a"),
+        ("seed=0 --cfg job threads=1", "--cfg job seed=0 threads=1"),
+        ("-m -c job --resolve seed=0", "-c job --resolve seed=0"),
+        ("seed=0 --info", "--info all seed=0"),
+        ("--info seed=0", "--info all seed=0"),
+        ("-i plugins seed=0", "-i plugins seed=0"),
+        ("seed=0 hydra.mode=RUN", "seed=0 hydra.mode=RUN"),
+        ("--config-dir ~/my", "--config-dir /home/me/my --multirun"),
+    ],
+)
+def test_options_of_hydra_may_stand_anywhere(
+    written: str, given: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", "/home/me")
+    assert with_options_first(written.split()) == given.split()
+
+
+@pytest.mark.parametrize("name", ["50", "0.5", "1e3", "007", "true", "null"])
+def test_files_of_groups_may_have_names_that_yaml_reads_as_numbers(name: str) -> None:
+    assert parsed(f"+ablation={name}") == name
+    assert parsed(f"+ablation=[mip, {name}]") == ["mip", name]
+    (_, first, second) = expand(with_quotes([f"+ablation={name},mip"]))
+    assert [first.label, second.label] == [name, "mip"]
+
+
+@pytest.mark.parametrize("axis", ["seed=0,1", "+ablation=mip,lean", "seed=0"])
+@pytest.mark.parametrize(
+    ("wrong", "named"),
+    [
+        ("steps=100", "did you mean train.steps"),
+        ("limits.minutes=1h", "limits.minutes"),
+        ("variant=bx", "did you mean box"),
+        ("store=a seed=[1", "seed=[1"),
+    ],
+)
+def test_a_mistake_beside_an_axis_is_named_and_not_the_axis(
+    sweep_here: RunCommand, axis: str, wrong: str, named: str
+) -> None:
+    code, _, err = sweep_here("scene=motorcycle", axis, *wrong.split(), "dry_run=true")
+    assert code == 1
+    assert named in err
+    assert "Ambiguous" not in err
+
+
+HEAD = "# @package _global_\n"
+
+
+@pytest.mark.parametrize(
+    ("content", "named"),
+    [
+        ("components: {mip: {every: 3}}", "ablation/mine.yaml: its first line must be `# @package"),
+        ("# @package _globl_\nseed: 1", "ablation/mine.yaml: its first line must be `# @package"),
+        (HEAD + "components: {mip: {evry: 3}}", "ablation/mine.yaml: components.mip.evry"),
+        (HEAD + "component: {mip: {every: 3}}", "'component' not in 'Conf'; did you mean compon"),
+        (HEAD + "components: {mip: {every: x}}", "components.mip.every: Value 'x' of type 'str'"),
+        (HEAD + "components: {3: 4}", "ablation/mine.yaml: components.3"),
+        (HEAD + "components: {plugins: {3: {}}}", "components.plugins.3: Key 3 (int)"),
+        (HEAD + "seed: [", "a YAML file of the config can't be read: .*mine.yaml"),
+        (HEAD + "seed: 1\nseed: 2", "found duplicate key seed"),
+        (HEAD + "seed: \udcff", "a YAML file of the config can't be read"),
+    ],
+)
+def test_a_mistake_in_a_file_of_the_users_own_is_named(
+    sweep_here: RunCommand, tmp_path: Path, content: str, named: str
+) -> None:
+    (tmp_path / "ablation").mkdir()
+    (tmp_path / "ablation/mine.yaml").write_bytes(content.encode(errors="surrogateescape"))
+    code, _, err = sweep_here("+ablation=mine", "--config-dir", str(tmp_path), "dry_run=true")
+    assert code == 1
+    assert re.search(re.escape(named).replace(r"\.\*", ".*"), err), err
+
+
+def test_an_axis_of_the_sweepers_own_settings_is_planned(sweep_here: RunCommand) -> None:
+    code, _, err = sweep_here(
+        "scene=motorcycle",
+        "variant.test_every=0",
+        '+hydra.sweeper.params.seed="0,1"',
+        "dry_run=true",
+    )
+    assert (code, "plan: 2 cells" in err) == (0, True)
+
+
+def test_a_glob_is_every_file_of_its_group_of_that_name(sweep_here: RunCommand) -> None:
+    _, _, err = sweep_here("scene=motorcycle", "+ablation=glob(mip*)", "dry_run=true")
+    assert "plan: 3 cells" in err
+    assert "/ mip_off_late /" in err
+
+
+def test_the_home_folder_of_a_store_is_not_a_folder_called_tilde(
+    sweep_here: RunCommand, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, children: object
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    (tmp_path / "home").mkdir()
+    sweep_here("scene=motorcycle", "preset=smoke", "+ablation=baseline", "store=~/s")
+    assert (tmp_path / "home/s/cells").is_dir()
+    assert not (tmp_path / "~").exists()
+
+
+def test_bytes_that_are_not_unicode_are_named() -> None:
+    with pytest.raises(XrgsError, match=r"store=\\udcff.*not valid Unicode"):
+        with_quotes(["store=\udcff"])
+
+
+def test_a_path_with_commas_may_end_with_all_folders_below(tmp_path: Path) -> None:
+    (tmp_path / "a, b").mkdir()
+    (override,) = with_quotes([f"scene.path={tmp_path}/a, b/**"])
+    assert override == f"scene.path='{tmp_path}/a, b/**'"
+
+
+@pytest.mark.slow
+def test_a_scene_with_odd_names_is_swept_and_reported(
+    forked_command: RunCommand, run_command: RunCommand, tmp_path: Path
+) -> None:
+    scene = tmp_path / f"-部屋 🙂 {{it's}} 50%=#1; {ACCENT}, a"
+    scene.mkdir()
+    views = ['-a b\'s & "c" (1) 🙂', f"[{ACCENT}]=50%#, $x.y"]
+    for name, file in zip(views, motorcycle.files().values(), strict=True):
+        shutil.copy(file, scene / f"{name}.png")
+    conf = ["preset=smoke", "train.steps=2", "variant.test_every=0", "variant.min_hr=1"]
+    conf += ["variant.long_side=185", "variant.sfm.reference=false"]
+    words = ("+ablation=curriculum", "scene=folder", f"scene.path={scene.name}", *conf)
+    store = "st öre, 'a' {b} 🙂"
+    code, out, err = forked_command("sweep", tmp_path, *words, f"store={store}")
+    assert code == 0, err
+    assert scene.name in out
+    home = tmp_path / store
+    for cell in (home / "cells").iterdir():
+        assert {file.stem for file in (cell / "renders").iterdir()} == set(views)
+    (report,) = (home / "reports").iterdir()
+    pictures = list((report / "figures").iterdir())
+    assert len(pictures) == 2
+    page = (report / "table.md").read_text()
+    assert all(f"](figures/{file.name})" in page and file.name.isascii() for file in pictures)
+    told = str(Path(*report.parts[-3:]))
+    for run, command, name in (
+        (forked_command, "report", told),
+        (run_command, "status", scene.name),
+    ):
+        code, out, err = run(command, tmp_path, "--store", store)
+        assert code == 0, err
+        assert name in out
+
+
+def test_help_names_every_choice(run_command: RunCommand, tmp_path: Path) -> None:
+    code, out, _ = run_command("sweep", tmp_path, "--help")
+    assert code == 0
+    for name in ("consistency", "llff/fern", "motorcycle", "laptop", "smoke"):
+        assert name in out
+
+
+@pytest.mark.parametrize("kind", [HydraException, ConfigKeyError])
+def test_an_error_of_hydra_is_one_line_with_a_hint(kind: type[Exception]) -> None:
+    with pytest.raises(XrgsError, match=r"^two \(hint\)$"), explained(" (hint)"):
+        raise kind("two\nlines")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["scene=fern"], "scene=fern: there is no such choice; did you mean llff/fern?"),
+        (["scene=q"], "choose from: captures/bonsai, captures/monstree, captures/ollie"),
+        (["steps=100"], "steps: there is no such key; did you mean train.steps"),
+        (["+steps=100"], "steps: there is no such key; did you mean train.steps"),
+        (["+train.stesp=4"], "train.stesp: there is no such key; did you mean train.steps?"),
+        (["ablaton=consistency"], "ablaton: there is no such key; did you mean ablation?"),
+        (["+ablation=consistancy"], "did you mean consistency?"),
+        (["sweeps=tabel1"], "sweeps=tabel1: there is no such choice; did you mean table1?"),
+        (["hydra/launcher=jobli"], "hydra/launcher=jobli: there is no such choice"),
+        (["dry_run=maybe"], "dry_run: Value 'maybe' is not a valid bool"),
+        (["seed=["], "seed=[: "),
+        (["garden"], "garden: to train on these photographs, type: xrgs-train garden"),
+        (["plus"], "plus: an ablation is given as +ablation=plus"),
+        (["fern"], "fern: a scene is given as scene=llff/fern"),
+        (["nothing"], "nothing: write KEY=VALUE"),
+        (["--seed", "3"], "--seed: there is no such option; write seed=3"),
+        (["--store=s"], "--store=s: there is no such option; write store=s"),
+        (["--fail-fast"], "--fail-fast: there is no such option; write fail_fast=true"),
+        (["--scene", "garden"], "--scene: there is no such option; write scene=garden"),
+        (["--minutes", "3"], "--minutes: there is no such option; see xrgs-sweep --help"),
+        (["+ablation=a,", "b"], "write it without the space: +ablation=a,b"),
+        (["seed=0", ",1"], "write it without the space: seed=0,1"),
+        (["+ablation=[a,", "b]"], "write it without the space: '+ablation=[a,b]'"),
+        (["+ablation=qqqq"], "there is no such choice; xrgs-sweep --help lists all "),
+    ],
+    ids=lambda value: value[0] if isinstance(value, list) else "",
+)
+def test_a_typo_is_one_line_with_what_was_meant(
+    sweep_here: RunCommand, tmp_path: Path, words: list[str], message: str
+) -> None:
+    (tmp_path / "garden").mkdir()
+    code, out, err = sweep_here(*words, *[] if "dry_run" in words[0] else ["dry_run=true"])
+    assert (code, out) == (1, "")
+    assert err.startswith("xrgs-sweep: ")
+    assert message in err
+    assert "HYDRA_FULL_ERROR" not in err
+    assert len(err.splitlines()) == 1
+
+
+def test_a_sweep_with_nothing_says_what_to_type(sweep_here: RunCommand, tmp_path: Path) -> None:
+    code, out, err = sweep_here()
+    assert (code, out) == (2, "")
+    assert "xrgs-train FOLDER" in err
+    assert "xrgs-sweep +ablation=consistency" in err
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("word", "read"),
+    [
+        ("train.steps=3e3", "train.steps=3000"),
+        ("train.steps=1e2,2.0,5", "train.steps=100,2,5"),
+        ("seed=1E1", "seed=10"),
+        ("variant.long_side=504.0", "variant.long_side=504"),
+        ("train.steps=1.5", "train.steps=1.5"),  # refused by its type
+        ("train.steps=range(0,9)", "train.steps=range(0,9)"),
+        ("train.validation=3e-1", "train.validation=3e-1"),  # no whole number
+        ("scene.path=1e3", "scene.path='1e3'"),
+    ],
+)
+def test_a_whole_number_may_be_written_in_any_way(word: str, read: str) -> None:
+    assert with_quotes([word]) == [read]

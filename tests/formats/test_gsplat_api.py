@@ -1,0 +1,386 @@
+"""`gsplat_api.rasterization` against gsplat 1.5.3: its torch code and its strategy."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import gsplat
+import pytest
+import torch
+from gsplat.cuda import _torch_impl
+from torch import Tensor
+
+from xrgs.formats.gsplat_api import RenderMode, rasterization
+
+WIDTH, HEIGHT = 37, 29
+MODES: tuple[RenderMode, ...] = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
+PARAMETERS = ("means", "quats", "scales", "opacities", "colors")
+
+
+class Scene(NamedTuple):
+    """Arguments of `rasterization`, float64; some Gaussians lie behind the cameras or outside."""
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    colors: Tensor
+    viewmats: Tensor
+    Ks: Tensor
+    backgrounds: Tensor
+
+    def to(self, dtype: torch.dtype) -> Scene:
+        return Scene(*(value.to(dtype) for value in self))
+
+    def arguments(self) -> dict[str, Any]:
+        return self._asdict() | {"width": WIDTH, "height": HEIGHT}
+
+
+def rotation_about(axis: tuple[float, float, float], angle: float) -> Tensor:
+    """Rodrigues' formula."""
+    x, y, z = torch.nn.functional.normalize(torch.tensor(axis, dtype=torch.float64), dim=0).tolist()
+    K = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
+    return torch.eye(3, dtype=torch.float64) + math.sin(angle) * K + (1 - math.cos(angle)) * K @ K
+
+
+def scene(count: int = 80, *, per_camera: bool = False, sh_degree: int | None = None) -> Scene:
+    generator = torch.Generator().manual_seed(0)
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator, dtype=torch.float64)
+
+    means = (uniform(count, 3) - 0.5) * torch.tensor([6.0, 5.0, 5.0]) + torch.tensor([0, 0, 2.0])
+    viewmats = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    viewmats[1, :3, :3] = rotation_about((0.3, 1.0, 0.2), 0.35)
+    viewmats[1, :3, 3] = torch.tensor([0.1, -0.2, 0.4])
+    Ks = torch.tensor(
+        [[[40.0, 0, 18], [0, 38.0, 15], [0, 0, 1]], [[33.0, 0, 20], [0, 35.0, 13], [0, 0, 1]]],
+        dtype=torch.float64,
+    )
+    prefix = (2, count) if per_camera else (count,)
+    colors = uniform(*prefix, 3)
+    if sh_degree is not None:
+        colors = uniform(*prefix, 16, 3) - 0.5
+    return Scene(
+        means=means.double(),
+        quats=torch.randn(count, 4, generator=generator, dtype=torch.float64),
+        scales=0.02 + 0.4 * uniform(count, 3),
+        opacities=uniform(count).clamp(0.001, 1.0).index_fill(0, torch.arange(5), 1.0),
+        colors=colors,
+        viewmats=viewmats,
+        Ks=Ks,
+        backgrounds=uniform(2, 3),
+    )
+
+
+def composite(
+    means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, depths: Tensor
+) -> tuple[Tensor, Tensor]:
+    """One image of gsplat's `RasterizeToPixels3DGSFwd.cu`, Gaussian after Gaussian.
+
+    Returns [H, W, D] without background and alpha [H, W, 1].
+    """
+    y, x = torch.meshgrid(
+        torch.arange(HEIGHT, dtype=torch.float64) + 0.5,
+        torch.arange(WIDTH, dtype=torch.float64) + 0.5,
+        indexing="ij",
+    )
+    image = torch.zeros(HEIGHT, WIDTH, colors.shape[-1], dtype=torch.float64)
+    transmittance = torch.ones(HEIGHT, WIDTH, dtype=torch.float64)
+    done = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    for i in torch.argsort(depths, stable=True).tolist():
+        dx, dy = means2d[i, 0] - x, means2d[i, 1] - y
+        a, b, c = conics[i]
+        sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
+        alpha = (opacities[i] * torch.exp(-sigma)).clamp_max(0.999)
+        drawn = (sigma >= 0) & (alpha >= 1 / 255) & ~done
+        after = transmittance * (1 - alpha)
+        done = done | (drawn & (after <= 1e-4))
+        drawn = drawn & ~done
+        image = image + torch.where(drawn, alpha * transmittance, 0.0)[..., None] * colors[i]
+        transmittance = torch.where(drawn, after, transmittance)
+    return image, (1 - transmittance)[..., None]
+
+
+def reference(
+    scene: Scene, mode: RenderMode, *, sh_degree: int | None, antialiased: bool = False
+) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+    """gsplat's own torch code up to the image plane, and the loop above from there on."""
+    covars, _ = _torch_impl._quat_scale_to_covar_preci(scene.quats, scene.scales, True, False)
+    radii, means2d, depths, conics, compensations = _torch_impl._fully_fused_projection(
+        scene.means,
+        covars,
+        scene.viewmats,
+        scene.Ks,
+        WIDTH,
+        HEIGHT,
+        calc_compensations=antialiased,
+    )
+    cameras = len(scene.viewmats)
+    opacities = scene.opacities.expand(cameras, -1)
+    if antialiased:
+        opacities = opacities * compensations
+    colors = scene.colors
+    if colors.ndim == (2 if sh_degree is None else 3):
+        colors = colors.expand(cameras, *colors.shape)
+    if sh_degree is not None:
+        centres = torch.inverse(scene.viewmats)[:, None, :3, 3]
+        directions = scene.means - centres
+        colors = _torch_impl._spherical_harmonics(sh_degree, directions, colors) + 0.5
+        colors = colors.clamp_min(0)
+    images, alphas = [], []
+    for i in range(cameras):
+        chosen = (radii[i] > 0).all(-1)
+        values = torch.cat([colors[i], depths[i][:, None]], dim=-1)[chosen]
+        flat = (means2d[i][chosen], conics[i][chosen], opacities[i][chosen])
+        image, alpha = composite(*flat, values, depths[i][chosen])
+        color, depth = image[..., :-1] + (1 - alpha) * scene.backgrounds[i], image[..., -1:]
+        if "ED" in mode:
+            depth = depth / alpha.clamp(min=1e-10)
+        parts = [color] * ("RGB" in mode) + [depth] * ("D" in mode)
+        images.append(torch.cat(parts, dim=-1))
+        alphas.append(alpha)
+    projected = {"radii": radii, "means2d": means2d, "depths": depths, "conics": conics}
+    return torch.stack(images), torch.stack(alphas), projected | {"opacities": opacities}
+
+
+def gradients(scene: Scene, colors: Tensor, alphas: Tensor) -> list[Tensor]:
+    """Gradients of one scalar of all channels in the five parameters and the backgrounds."""
+    generator = torch.Generator().manual_seed(1)
+    weights = [
+        torch.rand(x.shape, generator=generator, dtype=torch.float64) for x in (colors, alphas)
+    ]
+    total = (colors * weights[0].to(colors)).sum() + (alphas * weights[1].to(alphas)).sum()
+    inputs = [getattr(scene, name) for name in (*PARAMETERS, "backgrounds")]
+    found = torch.autograd.grad(total, inputs, allow_unused=True)
+    return [torch.zeros_like(x) if g is None else g for x, g in zip(inputs, found, strict=True)]
+
+
+def tracked(scene: Scene) -> Scene:
+    names = (*PARAMETERS, "backgrounds")
+    return scene._replace(**{n: getattr(scene, n).detach().requires_grad_() for n in names})
+
+
+@pytest.mark.parametrize(
+    ("mode", "antialiased", "sh_degree", "per_camera"),
+    [
+        *((mode, antialiased, None, False) for mode in MODES for antialiased in (False, True)),
+        *(("RGB+ED", False, degree, each) for degree in (0, 2, 3) for each in (False, True)),
+    ],
+)
+def test_images_alphas_and_gradients_are_gsplats(
+    backend: str, mode: RenderMode, antialiased: bool, sh_degree: int | None, per_camera: bool
+) -> None:
+    made = scene(per_camera=per_camera, sh_degree=None if sh_degree is None else 3)
+    if backend == "native":
+        made = made.to(torch.float32)
+    ours, theirs = tracked(made), tracked(made.to(torch.float64))
+    colors, alphas, _ = rasterization(
+        **ours.arguments(),
+        sh_degree=sh_degree,
+        render_mode=mode,
+        rasterize_mode="antialiased" if antialiased else "classic",
+        backend=backend,
+    )
+    expected = reference(theirs, mode, sh_degree=sh_degree, antialiased=antialiased)[:2]
+    relative, absolute = (2e-5, 2e-5) if backend == "native" else (0, 1e-10)
+    for mine, true in zip((colors, alphas), expected, strict=True):
+        torch.testing.assert_close(mine, true.to(mine.dtype), rtol=relative, atol=absolute)
+    true_gradients = gradients(theirs, *expected)
+    for mine, true in zip(gradients(ours, colors, alphas), true_gradients, strict=True):
+        if backend == "native":
+            assert (mine - true).norm() <= 1e-4 * true.norm()
+        else:
+            torch.testing.assert_close(mine, true, rtol=1e-7, atol=1e-8)
+
+
+def test_bands_above_degree_3_are_left_out(backend: str) -> None:
+    made = scene(sh_degree=3).to(torch.float32)
+    wide = made._replace(colors=torch.cat([made.colors, torch.ones(80, 9, 3)], dim=1))
+    expected, found = (
+        rasterization(**each.arguments(), sh_degree=3, backend=backend)[0] for each in (made, wide)
+    )
+    assert torch.equal(found, expected)
+
+
+def test_the_projections_in_meta_are_gsplats() -> None:
+    made = scene()
+    _, _, meta = rasterization(
+        **made.arguments(), packed=False, rasterize_mode="antialiased", radius_clip=2.0
+    )
+    _, _, expected = reference(made, "RGB", sh_degree=None, antialiased=True)
+    # gsplat's torch code leaves the opacity out of the radii; its kernels, as of
+    # `ProjectionEWA3DGSFused.cu`, do not.
+    reach = (2 * torch.log(expected["opacities"] * 255)).clamp_min(0).sqrt().clamp_max(3.33)
+    xx, xy, yy = expected["conics"].unbind(-1)
+    variances = torch.stack([yy, xx], dim=-1) / (xx * yy - xy * xy)[..., None]
+    radii = (reach[..., None] * variances.sqrt()).ceil()
+    size = torch.tensor([WIDTH, HEIGHT])
+    means2d = expected["means2d"]
+    drawn = ((means2d + radii > 0) & (means2d - radii < size)).all(-1)
+    drawn &= (expected["depths"] > 0.01) & (radii > 2).any(-1)
+    assert 10 < drawn.sum() < drawn.numel() - 10
+    assert torch.equal(meta["radii"], torch.where(drawn[..., None], radii, 0).int())
+    for name in ("means2d", "depths", "conics", "opacities"):
+        torch.testing.assert_close(meta[name][drawn], expected[name][drawn])
+    assert (meta["width"], meta["height"], meta["n_cameras"]) == (WIDTH, HEIGHT, 2)
+
+
+def test_packed_meta_lists_the_drawn_gaussians_camera_by_camera() -> None:
+    arguments = scene().arguments()
+    dense, packed = (rasterization(**arguments, packed=p)[2] for p in (False, True))
+    cameras, gaussians = torch.nonzero((dense["radii"] > 0).all(-1), as_tuple=True)
+    assert torch.equal(packed["camera_ids"], cameras)
+    assert torch.equal(packed["gaussian_ids"], gaussians)
+    assert dense["gaussian_ids"] is None
+    for name in ("radii", "means2d", "depths", "conics", "opacities"):
+        assert torch.equal(packed[name], dense[name][cameras, gaussians])
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_means2d_has_the_image_plane_gradient(packed: bool) -> None:
+    made = scene()
+    _, _, projected = reference(made, "RGB", sh_degree=None)
+    ours = tracked(made)
+    colors, _, meta = rasterization(**ours.arguments(), packed=packed)
+    meta["means2d"].retain_grad()
+    torch.autograd.backward(colors.square().sum())
+    found = meta["means2d"].grad
+    if packed:
+        dense = torch.zeros_like(projected["means2d"])
+        dense[meta["camera_ids"], meta["gaussian_ids"]] = found
+        found = dense
+
+    flat = projected["means2d"].detach().requires_grad_()
+    total = torch.zeros((), dtype=torch.float64)
+    for i in range(2):
+        chosen = (projected["radii"][i] > 0).all(-1)
+        conics, opacities, depths = (
+            projected[name][i][chosen].detach() for name in ("conics", "opacities", "depths")
+        )
+        image, alpha = composite(flat[i][chosen], conics, opacities, made.colors[chosen], depths)
+        total = total + (image + (1 - alpha) * made.backgrounds[i]).square().sum()
+    (expected,) = torch.autograd.grad(total, flat)
+    torch.testing.assert_close(found, expected, rtol=1e-7, atol=1e-9)
+
+
+def test_absgrad_is_no_less_than_the_gradient() -> None:
+    meta = {}
+    for absgrad in (False, True):
+        ours = tracked(scene())
+        colors, _, meta[absgrad] = rasterization(**ours.arguments(), packed=False, absgrad=absgrad)
+        torch.autograd.backward(colors.square().sum())
+    plain, absolute = meta[False]["means2d"].grad, meta[True]["means2d"].absgrad
+    assert meta[True]["means2d"].grad is None
+    assert (absolute >= plain.abs() - 1e-12).all()
+    assert (absolute > plain.abs() + 1e-6).any()
+    with pytest.raises(NotImplementedError, match="absgrad"):
+        rasterization(**scene().arguments(), absgrad=True, render_mode="RGB+D")
+
+
+def test_far_plane_hides_what_lies_behind_it() -> None:
+    made = scene()
+    near = made.means[:, 2] < 2.0
+    arguments = made.arguments() | {"viewmats": made.viewmats[:1], "Ks": made.Ks[:1]}
+    arguments["backgrounds"] = None
+    chosen = {name: arguments[name][near] for name in PARAMETERS}
+    found, _, _ = rasterization(**arguments, far_plane=2.0, render_mode="RGB+D")
+    expected, _, _ = rasterization(**(arguments | chosen), render_mode="RGB+D")
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("size", [1e-6, 1e6])
+def test_features_of_any_sign_size_and_number_are_composited(
+    size: float, dtype: torch.dtype
+) -> None:
+    """Five channels are two passes; the rasterizer itself cuts colors off at 0."""
+    made = scene().to(dtype)
+    features = (torch.linspace(-1, 1, 80 * 5, dtype=dtype).reshape(80, 5).sin()) * size
+    arguments = made.arguments() | {"colors": features, "backgrounds": None}
+    found, _, _ = rasterization(**arguments)
+    wide = made.to(torch.float64)._replace(
+        colors=features.double(), backgrounds=torch.zeros(2, 5, dtype=torch.float64)
+    )
+    expected, _, _ = reference(wide, "RGB", sh_degree=None)
+    error = (found - expected).abs().max() / size
+    assert error < (2e-5 if dtype == torch.float32 else 1e-12)
+
+
+def test_black_gaussians_have_gradients() -> None:
+    """At the value where the rasterizer clamps."""
+    made = scene()
+    ours = tracked(made._replace(colors=torch.zeros_like(made.colors)))
+    colors, _, meta = rasterization(**ours.arguments(), packed=False)
+    torch.autograd.backward(colors.sum())
+    drawn = (meta["radii"] > 0).all(-1).any(0)
+    assert ours.colors.grad is not None
+    assert (ours.colors.grad[drawn] > 0).any(-1).sum() > 10
+
+
+def test_no_gaussians_give_the_background() -> None:
+    made = scene()
+    nothing = {name: getattr(made, name)[:0] for name in PARAMETERS}
+    colors, alphas, meta = rasterization(**(made.arguments() | nothing), render_mode="RGB+ED")
+    assert torch.equal(colors[..., :3], made.backgrounds[:, None, None].expand(2, HEIGHT, WIDTH, 3))
+    assert not alphas.any()
+    assert not colors[..., 3].any()
+    assert meta["radii"].shape == (0, 2)
+
+
+def test_gsplats_default_strategy_runs_on_it() -> None:
+    """A few steps with gsplat's own densification, in which Gaussians are grown and pruned."""
+    made = scene(60).to(torch.float32)
+    target, _, _ = rasterization(**made.arguments())
+    generator = torch.Generator().manual_seed(2)
+    moved = made.means + 0.2 * torch.randn(made.means.shape, generator=generator)
+    params = {
+        "means": moved,
+        "quats": made.quats,
+        "scales": made.scales.log(),
+        "opacities": torch.logit(made.opacities.clamp(0.01, 0.95)),
+        "colors": made.colors,
+    }
+    params = {name: torch.nn.Parameter(value.clone()) for name, value in params.items()}
+    optimizers = {name: torch.optim.Adam([p], lr=5e-3) for name, p in params.items()}
+    strategy = gsplat.DefaultStrategy(
+        refine_start_iter=2, refine_every=4, reset_every=1000, grow_grad2d=1e-3, prune_opa=0.02
+    )
+    strategy.check_sanity(params, optimizers)
+    state = strategy.initialize_state(scene_scale=1.0)
+    losses, counts = [], []
+    for step in range(12):
+        colors, _, info = rasterization(
+            params["means"],
+            params["quats"],
+            params["scales"].exp(),
+            params["opacities"].sigmoid(),
+            params["colors"],
+            made.viewmats,
+            made.Ks,
+            WIDTH,
+            HEIGHT,
+            backgrounds=made.backgrounds,
+            packed=False,
+        )
+        strategy.step_pre_backward(params, optimizers, state, step, info)
+        loss = (colors - target).square().mean()
+        torch.autograd.backward(loss)
+        if step == 0:
+            seen = (info["radii"] > 0).all(-1)
+            size = torch.tensor([WIDTH, HEIGHT]) / 2 * 2  # half the image, times two cameras
+            norms = (info["means2d"].grad * size).norm(dim=-1)
+            expected = torch.where(seen, norms, 0).sum(0), seen.sum(0)
+        for optimizer in optimizers.values():
+            optimizer.step()
+            optimizer.zero_grad()
+        strategy.step_post_backward(params, optimizers, state, step, info, packed=False)
+        if step == 0:
+            torch.testing.assert_close(state["grad2d"], expected[0])
+            torch.testing.assert_close(state["count"], expected[1].float())
+        losses.append(loss.item())
+        counts.append(len(params["means"]))
+    assert losses[4] < 0.95 * losses[0]  # before the strategy changes any Gaussian
+    assert counts[:4] == [60] * 4
+    assert len({*counts}) >= 3, "Gaussians are grown and pruned at steps 4 and 8"

@@ -1,0 +1,537 @@
+"""What a variant holds: tags, degraded views, poses and their report; SfM is run once for all."""
+
+from __future__ import annotations
+
+import shutil
+import zlib  # noqa: F401  pycolmap corrupts the heap where it is imported before zlib
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+import pytest
+
+from tests.photos.scene_confs import scene_conf
+from xrgs import config
+from xrgs.config import VariantConf
+from xrgs.errors import XrgsError
+from xrgs.mixture import mixing, sfm, sfm_retries
+from xrgs.mixture.degradations import DEGRADATIONS, resolve_degradation
+from xrgs.mixture.photographs import prepare_hr_views, write_degraded
+from xrgs.mixture.sfm import Reconstruction, SfmImage
+from xrgs.mixture.split import check_variant_conf
+from xrgs.mixture.tags import POLICIES
+from xrgs.mixture.views import SceneFailed, Variant, View
+from xrgs.photos import images, scenes
+from xrgs.photos.scenes import Scene, procedural
+
+pytestmark = pytest.mark.slow
+
+Make = Callable[..., VariantConf]
+Mix = Callable[..., Variant]
+VIEWS = 12
+
+
+@pytest.fixture(scope="module")
+def configured(configured: Make) -> Make:
+    """Small views, whose poses are compared with SfM of the undegraded photographs."""
+    return partial(configured, long_side=160, min_hr=0, test_every=4, sfm={"reference": True})
+
+
+@pytest.fixture(scope="module")
+def conf(configured: Make) -> VariantConf:
+    return configured()
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory: pytest.TempPathFactory, conf: VariantConf) -> Scene:
+    cache = tmp_path_factory.mktemp("scenes")
+    return scenes.resolve(
+        scene_conf("procedural", name="p", views=VIEWS),
+        cache,
+        conf.long_side,
+    )
+
+
+@pytest.fixture(scope="module")
+def reconstruction(
+    rendered: Scene, tmp_path_factory: pytest.TempPathFactory, conf: VariantConf
+) -> Reconstruction:
+    """SfM of the undegraded photographs, run once for all tests of what comes before and after."""
+    work = tmp_path_factory.mktemp("work")
+    inputs = []
+    for file in rendered.files.values():
+        shutil.copy(str(file), work / file.name)
+        inputs.append(SfmImage(file.name, file.stem, "all"))
+    return sfm.reconstruct(inputs, work, work, conf.sfm)
+
+
+@pytest.fixture
+def given() -> list[list[str]]:
+    """The files that each call of SfM gets."""
+    return []
+
+
+@pytest.fixture
+def mix(
+    configured: Make,
+    rendered: Scene,
+    reconstruction: Reconstruction,
+    given: list[list[str]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> Mix:
+    """(scene, **changes) -> `mix_resolutions` with `reconstruction` in the place of SfM.
+
+    The default scene has no exact cameras.
+    """
+
+    def recall(inputs: Sequence[SfmImage], *_: object) -> Reconstruction:
+        given.append([image.file for image in inputs])
+        return reconstruction
+
+    def run(scene: Scene | None = None, **changes: Any) -> Variant:
+        work, out = tmp_path / "work", tmp_path / "out"
+        work.mkdir()
+        (out / "images").mkdir(parents=True)
+        scene = scene or replace(rendered, viewmats={})
+        return mixing.mix_resolutions(scene, configured(**changes), work, out)
+
+    monkeypatch.setattr(sfm, "reconstruct", recall)
+    return run
+
+
+def of(made: Variant, split: str, tag: str) -> list[View]:
+    return [view for view in made.views if (view.split, view.tag) == (split, tag)]
+
+
+def number(view: View) -> int:
+    return int(view.name[-3:])
+
+
+# tags
+
+
+def test_by_sampling_rate_the_highest_are_hr_and_nothing_is_degraded(
+    mix: Mix, given: list[list[str]]
+) -> None:
+    made = mix(tags="sampling_rate")
+    high, low = of(made, "train", "HR"), of(made, "train", "LR")
+    assert len(high) == round(0.3 * 9)
+    assert len(high) + len(low) == 9
+    assert min(v.sampling_rate for v in high) >= max(v.sampling_rate for v in low)
+    assert not of(made, "original", "HR")
+    assert {(v.width, v.height) for v in made.views} == {(160, 120)}
+    assert given == [[f"sfm/{i:05d}.png" for i in range(VIEWS)]]
+    assert made.report["degradation"] == "none"
+    assert made.report["pose_error"] == {}
+    assert made.report["rho"]["HR"][0] == min(v.sampling_rate for v in high)
+
+
+def test_photographs_of_one_resolution_are_said_to_make_no_mixture(mix: Mix) -> None:
+    """The embedded scene's cameras are all about as far away: rho differs by 15 % at most."""
+    made = mix(tags="sampling_rate")
+    note, need = made.report["notes"]
+    rho = [view.sampling_rate for view in made.views if view.split == "train"]
+    assert "variant.tags=sampling_rate is meaningless" in note
+    assert f"rho is {min(rho):.3f} to {max(rho):.3f}" in note
+    assert need == (
+        "sampling rates of training views differ by 1.1 where they show the same points:"
+        " components.supersampled, where it is on, renders none of the views larger"
+    )
+
+
+def test_a_threshold_of_the_rate_takes_those_above_it(mix: Mix) -> None:
+    made = mix(tags="sampling_rate", hr_above=0.93)
+    assert of(made, "train", "HR")
+    assert all(v.sampling_rate >= 0.93 for v in of(made, "train", "HR"))
+    assert all(v.sampling_rate < 0.93 for v in of(made, "train", "LR"))
+
+
+def test_by_distance_the_closest_are_hr(mix: Mix) -> None:
+    """Every camera looks at one point, so that the exact cameras say which are close to it."""
+    made = mix(tags="distance")
+    poses = procedural.viewmats(VIEWS)
+    middle = np.array([0.0, 0.1, 5.5, 1.0])
+    depth = {v.name: (poses[number(v)] @ middle)[2] for v in made.views}
+    high, low = ([depth[v.name] for v in of(made, "train", tag)] for tag in ("HR", "LR"))
+    assert np.mean(high) < np.mean(low) - 0.2
+    assert min(low) > min(high)
+
+
+def test_by_megapixels_the_larger_photographs_are_hr(
+    mix: Mix, rendered: Scene, tmp_path: Path, given: list[list[str]]
+) -> None:
+    files = {name: tmp_path / file.name for name, file in rendered.files.items()}
+    for i, (name, file) in enumerate(rendered.files.items()):
+        photo = images.read(file)
+        images.save(files[name], images.resize(photo, 80, 60) if i % 3 else photo)
+    scene = replace(rendered, files=files, viewmats={})
+    made = mix(scene, tags="megapixels", hr_above=0.75)
+    assert {number(v) for v in of(made, "train", "HR")} == {3, 6, 9}
+    assert all((v.width, v.height) == (80, 60) for v in of(made, "train", "LR"))
+    assert not of(made, "original", "HR")
+    assert made.report["rho"]["LR"][1] == pytest.approx(0.5, abs=0.1)
+    assert round(min(view.supersampling for view in of(made, "train", "LR"))) == 2
+    assert made.report["notes"][-1].endswith("renders 6 of 9 of the views larger")
+    for view in of(made, "test", "HR"):  # at its own full size
+        assert (view.width, view.height) == ((160, 120) if number(view) % 3 == 0 else (80, 60))
+
+
+def test_photographs_of_one_class_alone_are_refused(mix: Mix, given: list[list[str]]) -> None:
+    with pytest.raises(XrgsError, match=r"variant\.tags=megapixels: every training view is HR at"):
+        mix(tags="megapixels")
+    assert given == []
+
+
+def test_a_threshold_above_all_but_the_held_out_is_named(mix: Mix) -> None:
+    with pytest.raises(XrgsError, match=r"variant\.hr_above=1\.0; their values are 0\.\d+ to"):
+        mix(tags="sampling_rate", hr_above=1.0, test_every=2)
+
+
+@pytest.mark.parametrize(("fraction", "tag"), [(0.0, "LR"), (1.0, "HR")])
+def test_one_class_alone_where_the_config_says_so(mix: Mix, fraction: float, tag: str) -> None:
+    made = mix(hr_fraction=fraction)
+    assert len(of(made, "train", tag)) == 9
+    assert len(of(made, "original", "HR")) == (9 if tag == "LR" else 0)
+    assert len(of(made, "test", "HR")) == 3
+
+
+# degradations
+
+
+def test_each_degraded_view_has_its_original_from_the_same_pose(mix: Mix) -> None:
+    made = mix()
+    low = of(made, "train", "LR")
+    originals = {view.name: view for view in of(made, "original", "HR")}
+    assert sorted(originals) == [view.name for view in low]
+    for view in low:
+        high = originals[view.name]
+        assert np.array_equal(high.viewmat, view.viewmat)
+        assert (high.width, high.height) == (160, 120) == (view.width * 5, view.height * 5)
+        assert high.K[:2] == pytest.approx(view.K[:2] * 5)
+        assert view.supersampling == pytest.approx(5 * high.supersampling, rel=0.01)
+        assert high.supersampling == pytest.approx(1, rel=0.2)
+        shrunk = images.resize(images.read(high.file), view.width, view.height)
+        # The lens is nearly a pinhole, so that undistortion and downsampling commute.
+        assert np.abs(shrunk - images.read(view.file)).mean() < 0.01
+
+
+@pytest.mark.parametrize("how", ["digital_zoom", "jpeg"])
+def test_a_degradation_may_keep_the_size(mix: Mix, given: list[list[str]], how: str) -> None:
+    made = mix(degradation=how, hr_fraction=0.5)
+    assert {(v.width, v.height) for v in made.views} == {(160, 120)}
+    originals = {v.name: v for v in of(made, "original", "HR")}
+    for view in of(made, "train", "LR"):
+        before, after = images.read(originals[view.name].file), images.read(view.file)
+        assert 0.005 < np.abs(before - after).mean() < 0.1
+        assert (
+            view.sampling_rate == originals[view.name].sampling_rate
+        )  # px per unit; not what is in them
+        resolved = {"jpeg": 1, "digital_zoom": 5}[how]
+        assert view.supersampling == pytest.approx(resolved * originals[view.name].supersampling)
+    low = {number(v) for v in of(made, "train", "LR")}
+    assert given[0] == [f"{'sfm_lr' if i in low else 'sfm'}/{i:05d}.png" for i in range(VIEWS)]
+
+
+@pytest.mark.parametrize("how", ["box", "lanczos", "phone"])
+def test_lr_views_of_other_kernels_are_smaller(mix: Mix, given: list[list[str]], how: str) -> None:
+    made = mix(degradation=how, hr_fraction=0.5)
+    low = of(made, "train", "LR")
+    originals = {v.name: v for v in of(made, "original", "HR")}
+    assert {v.name for v in low} == originals.keys()
+    for view in low:
+        assert (view.width, view.height) == (32, 24)
+        assert view.sampling_rate == pytest.approx(originals[view.name].sampling_rate / 5)
+        high = images.read(originals[view.name].file)
+        assert 0 < np.abs(images.resize(high, 32, 24) - images.read(view.file)).mean() < 0.1
+    numbers = {number(v) for v in low}
+    expected = [f"{'sfm_lr_up' if i in numbers else 'sfm'}/{i:05d}.png" for i in range(VIEWS)]
+    assert given[0] == expected
+
+
+@pytest.mark.parametrize(("degradation", "said"), [("auto", True), ("digital_zoom", False)])
+def test_the_blur_of_lr_views_is_in_the_report_and_said(
+    mix: Mix, monkeypatch: pytest.MonkeyPatch, degradation: str, *, said: bool
+) -> None:
+    """A view that was zoomed on purpose is blurry on purpose."""
+    monkeypatch.setattr(mixing, "lr_blur", lambda _: 0.87)
+    made = mix(hr_fraction=0.5, degradation=degradation)
+    assert made.report["lr_blur"] == 0.87
+    if not said:
+        assert made.report["notes"] == []
+        return
+    (note,) = made.report["notes"]
+    assert note.startswith("LR photographs are blurrier than their pixels: by a Gaussian of 0.87")
+
+
+def test_noise_depends_on_a_views_name_and_on_the_seed_alone(
+    rendered: Scene, configured: Make, tmp_path: Path
+) -> None:
+    """In another order, and beside other views, a view has the same bytes."""
+    conf = configured(degradation="phone", factor=2)
+    photos = prepare_hr_views(rendered, conf, tmp_path)
+
+    def written(which: Sequence[int], **changes: Any) -> dict[int, bytes]:
+        write_degraded(photos, which, replace(conf, **changes))
+        return {i: (photos.folder / photos.file("lr", i)).read_bytes() for i in which}
+
+    first = written([0, 1, 2])
+    assert len(set(first.values())) == 3
+    assert written([2, 0]) == {i: first[i] for i in (0, 2)}
+    assert written([0], seed=1)[0] != first[0]
+
+
+def test_views_tagged_after_sfm_can_be_degraded_after_it(mix: Mix, given: list[list[str]]) -> None:
+    made = mix(tags="distance", degradation="downsample")
+    assert given == [[f"sfm/{i:05d}.png" for i in range(VIEWS)]]
+    low = of(made, "train", "LR")
+    assert {(v.width, v.height) for v in low} == {(32, 24)}
+    assert [v.name for v in of(made, "original", "HR")] == [v.name for v in low]
+
+
+# poses
+
+
+def test_the_poses_are_compared_with_those_of_the_undegraded(
+    mix: Mix, given: list[list[str]]
+) -> None:
+    made = mix()
+    assert made.report["notes"] == []
+    assert len(given) == 2
+    assert sum(file.startswith("sfm_lr_up/") for file in given[0]) == len(of(made, "train", "LR"))
+    assert given[1] == [f"sfm/{i:05d}.png" for i in range(VIEWS)]
+    assert made.report["pose_error"]["position_percent"] == pytest.approx(0, abs=1e-6)
+    assert made.report["pose_error_against"] == "SfM of the undegraded photographs"
+    assert made.report["reference"]["registered"] == VIEWS
+    assert made.report["reference"]["seconds"] >= 0
+
+
+def test_exact_cameras_need_no_second_run_of_sfm(
+    mix: Mix, rendered: Scene, given: list[list[str]]
+) -> None:
+    made = mix(rendered)
+    assert len(given) == 1
+    assert made.report["pose_error_against"] == "exact cameras"
+    assert 0 < made.report["pose_error"]["position_percent"] < 5
+
+
+EMPTY = Reconstruction(
+    {},
+    {},
+    np.zeros((0, 3)),
+    np.zeros((0, 3), np.uint8),
+    {},
+    {"lr_images": "", "registered": 0, "models": [], "points": 0},
+)
+
+
+def test_a_refused_attempt_is_followed_by_the_next(
+    conf: VariantConf,
+    rendered: Scene,
+    reconstruction: Reconstruction,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    results = iter([EMPTY, reconstruction])
+    monkeypatch.setattr(sfm, "reconstruct", lambda *_: next(results))
+    (tmp_path / "out/images").mkdir(parents=True)
+    made = mixing.mix_resolutions(rendered, conf, tmp_path, tmp_path / "out")
+    attempts = made.report["attempts"]
+    assert [(a["attempt"], a["registered"]) for a in attempts] == [
+        ("configured", 0),
+        ("relaxed", VIEWS),
+    ]
+    assert "0 of 12 photographs are placed" in attempts[0]["refused"]
+    assert attempts[1]["refused"] == ""
+    assert made.report["registered"] == len({v.name for v in made.views}) == VIEWS
+
+
+def test_where_every_attempt_is_refused_the_report_has_them_all(
+    conf: VariantConf, rendered: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sfm, "reconstruct", lambda *_: EMPTY)
+    (tmp_path / "out/images").mkdir(parents=True)
+    with pytest.raises(
+        SceneFailed, match="scene p failed: 0 of 12 photographs are placed"
+    ) as caught:
+        mixing.mix_resolutions(rendered, conf, tmp_path, tmp_path / "out")
+    tried = [a["attempt"] for a in caught.value.report["attempts"]]
+    attempts = sfm_retries.sfm_attempts(conf.sfm, VIEWS, any_smaller=True)
+    assert tried == [attempt.name for attempt in attempts]
+    assert tried[-1] == "native"
+
+
+def part(model: Reconstruction, views: int) -> Reconstruction:
+    """The first views of a model."""
+    first = {i: model.viewmats[i] for i in range(views)}
+    return replace(
+        model, viewmats=first, report=model.report | {"models": [views, 3], "registered": views}
+    )
+
+
+@pytest.mark.parametrize(
+    ("undegraded", "degradation", "said"),
+    [
+        (10, "downsample", "undegraded, 10 of 12 photographs are placed. To try: variant.factor=3"),
+        (5, "downsample", "undegraded, 5 of 12 photographs are placed. To try: variant.sfm.long"),
+        (10, "none", "requires more. To try: variant.sfm.long_side=0 (the photographs have 160"),
+    ],
+)
+def test_a_failed_scene_says_who_is_missing_why_and_what_to_try(
+    configured: Make,
+    rendered: Scene,
+    reconstruction: Reconstruction,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    undegraded: int,
+    degradation: str,
+    said: str,
+) -> None:
+    def reconstruct(inputs: Sequence[SfmImage], *_: object) -> Reconstruction:
+        mixed = degradation == "none" or any("lr" in image.file for image in inputs)
+        return part(reconstruction, 5 if mixed else undegraded)
+
+    monkeypatch.setattr(sfm, "reconstruct", reconstruct)
+    (tmp_path / "out/images").mkdir(parents=True)
+    split = {"selection": "uniform", "hr_fraction": 0.5}
+    conf = configured(degradation=degradation, sfm={"long_side": 100}, **split)
+    with pytest.raises(SceneFailed) as caught:
+        mixing.mix_resolutions(rendered, conf, tmp_path, tmp_path / "out")
+    message = str(caught.value)
+    points = len(reconstruction.points)
+    assert message.startswith(
+        f"scene p failed: 5 of 12 photographs are placed, {points} points; not placed: view_005, "
+        "view_006, view_007, view_008, view_009, view_010 and 1 more; variant.sfm.min_registered"
+    )
+    assert said in message
+    assert "photographs between the separate parts of 5 and 3, variant.poses=FOLDER" in message
+    assert message.endswith("variant.sfm.min_registered=0.41 to go on without the others.")
+    expected = undegraded if degradation == "downsample" else None
+    assert caught.value.report.get("reference", {}).get("registered") == expected
+
+
+# the choices in conf/
+
+
+@pytest.mark.parametrize(
+    ("name", "tags", "degradation"),
+    [
+        ("box", "flag", "box"),
+        ("digital_zoom", "flag", "digital_zoom"),
+        ("distance", "distance", "none"),
+        ("jpeg", "flag", "jpeg"),
+        ("lanczos", "flag", "lanczos"),
+        ("megapixels", "megapixels", "none"),
+        ("phone", "flag", "phone"),
+        ("sampling_rate", "sampling_rate", "none"),
+        ("", "flag", "downsample"),
+    ],
+)
+def test_every_variant_in_conf_is_valid(
+    compose: Callable[..., config.Conf], name: str, tags: str, degradation: str
+) -> None:
+    conf = compose(*([f"variant={name}"] if name else [])).variant
+    check_variant_conf(conf)
+    assert (conf.tags, resolve_degradation(conf)) == (tags, degradation)
+
+
+def test_every_tag_and_degradation_has_a_variant_in_conf() -> None:
+    files = {file.stem for file in (config.CONF_DIR / "variant").iterdir()}
+    assert files == POLICIES.keys() | DEGRADATIONS.keys() - {"downsample"}  # the default
+
+
+# what the user gives
+
+
+def write_poses(folder: Path, names: Sequence[str]) -> None:
+    """Write a model with the embedded scene's exact cameras, at twice its photographs' size."""
+    model = pycolmap.Reconstruction()
+    fx, fy, cx, cy = (procedural.intrinsics(320, 240)[i] for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    camera = pycolmap.Camera(
+        camera_id=1, model="PINHOLE", width=320, height=240, params=[fx, fy, cx, cy]
+    )
+    model.add_camera_with_trivial_rig(camera)
+    for i, name in enumerate(names):
+        matrix = procedural.viewmats(VIEWS)[int(name[-3:])]
+        image = pycolmap.Image(name=f"{name}.jpg", camera_id=1, image_id=i + 1)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(matrix[:3]))
+    for point in np.random.default_rng(0).uniform((-1, -1, 5), (1, 1, 6), (20, 3)):
+        model.add_point3D(point, pycolmap.Track())
+    folder.mkdir()
+    model.write_binary(folder)
+
+
+def test_given_poses_replace_sfm_and_are_scaled_for_lr_views(
+    mix: Mix, rendered: Scene, given: list[list[str]], tmp_path: Path
+) -> None:
+    names = list(rendered.files)
+    write_poses(tmp_path / "poses", names[:-1])
+    made = mix(poses=str(tmp_path / "poses"))
+    assert given == [], "no SfM, nor one of the undegraded photographs"
+    assert made.report["not_registered"] == names[-1:]
+    assert {view.name for view in made.views} == set(names[:-1])
+    exact = procedural.intrinsics(160, 120)
+    matrices = procedural.viewmats(VIEWS)
+    # Given poses are moved to a world of their own, rigidly and all alike.
+    first = made.views[0]
+    to_given = np.linalg.inv(first.viewmat) @ matrices[number(first)]
+    assert np.allclose(to_given[:3, :3] @ to_given[:3, :3].T, np.eye(3), atol=1e-9)
+    for view in made.views:
+        assert np.allclose(view.viewmat @ to_given, matrices[number(view)], atol=1e-9)
+        scale = view.width / 160
+        assert scale in {1, 1 / 5}
+        assert np.allclose(view.K, np.diag([scale, scale, 1]) @ exact, atol=1e-9)
+    assert {v.name for v in of(made, "train", "LR")} == set(made.report["lr"]) - {names[-1]}
+
+
+def test_too_few_given_poses_are_refused(mix: Mix, rendered: Scene, tmp_path: Path) -> None:
+    write_poses(tmp_path / "poses", list(rendered.files)[:5])
+    with pytest.raises(
+        SceneFailed,
+        match=r"variant\.poses: 5 of 12 photographs are placed, 20 points; not placed: view_005",
+    ):
+        mix(poses=str(tmp_path / "poses"))
+
+
+def test_named_test_views_are_held_out(mix: Mix) -> None:
+    made = mix(test=["view_001", "view_006"], test_every=0)
+    assert {v.name for v in made.views if v.split == "test"} == {"view_001", "view_006"}
+    assert not {"view_001", "view_006"} & {v.name for v in made.views if v.split == "train"}
+    assert made.held_out
+
+
+# real photographs
+
+
+@pytest.mark.data
+def test_a_collection_of_many_cameras_is_registered(
+    configured: Make, data_root: Path, tmp_path: Path
+) -> None:
+    """Sixteen photographs of as many tourists, all of differing sizes, at a quarter of these."""
+    source = data_root / "captures" / "reichstag" / "images"
+    if not source.is_dir():
+        pytest.skip(f"{source} is not there")
+    files = tuple(sorted(source.iterdir())[:16])
+    sizes = [images.size(file) for file in files]
+    few = {"max_num_features": 1500, "long_side": 640}
+    conf = configured(long_side=320, tags="sampling_rate", factor=2, sfm=few)
+    (tmp_path / "out/images").mkdir(parents=True)
+    made = mixing.mix_resolutions(
+        Scene("reichstag", "", {file.stem: file for file in files}),
+        conf,
+        tmp_path,
+        tmp_path / "out",
+    )
+    assert made.report["registered"] >= 12
+    assert made.report["cameras"] == 16
+    scale = 320 / max(max(size) for size in sizes)
+    by_name = dict(zip((file.stem for file in files), sizes, strict=True))
+    for view in made.views:
+        width, height = by_name[view.name]
+        assert 0 <= round(width * scale) - view.width < 2
+        assert 0 <= round(height * scale) - view.height < 2
+    assert min(view.sampling_rate for view in made.views) < 0.8  # 0.72 when this was written

@@ -1,0 +1,269 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from math import nan
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from xrgs.config import PhoneConf, VariantConf
+from xrgs.errors import XrgsError
+from xrgs.mixture.degradations import DEGRADATIONS
+from xrgs.mixture.split import (
+    check_test_names,
+    check_variant_conf,
+    hr_geometry,
+    shrink_factor,
+    split_views,
+)
+from xrgs.splat.ssim import WINDOW
+
+Make = Callable[..., VariantConf]
+
+
+def names(views: int) -> list[str]:
+    return [f"view_{i:03d}" for i in range(views)]
+
+
+CHANGES = st.fixed_dictionaries(
+    {
+        "hr_fraction": st.floats(0, 1),
+        "min_hr": st.integers(0, 5),
+        "selection": st.sampled_from(["random", "uniform"]),
+        "test_every": st.sampled_from([0, 2, 3, 8]),
+        "seed": st.integers(0, 1000),
+    }
+)
+
+
+@given(st.integers(2, 200), CHANGES)
+def test_the_parts_are_disjoint_ordered_and_cover_all(
+    configured: Make, views: int, changes: dict[str, Any]
+) -> None:
+    parts = split_views(names(views), configured(**changes))
+    assert sorted(parts.test + parts.hr + parts.lr) == list(range(views))
+    for part in (parts.test, parts.hr, parts.lr):
+        assert list(part) == sorted(part)
+
+
+@given(st.integers(2, 200), CHANGES)
+def test_the_share_that_stays_hr_is_exact(
+    configured: Make, views: int, changes: dict[str, Any]
+) -> None:
+    conf = configured(**changes)
+    parts = split_views(names(views), conf)
+    train = len(parts.hr) + len(parts.lr)
+    expected = max(conf.min_hr, round(conf.hr_fraction * train))
+    assert len(parts.hr) == min(train, expected)
+
+
+@given(st.integers(2, 200), CHANGES)
+def test_every_nth_view_is_held_out_and_none_where_it_is_zero(
+    configured: Make, views: int, changes: dict[str, Any]
+) -> None:
+    conf = configured(**changes)
+    expected = [i for i in range(views) if conf.test_every and i % conf.test_every == 0]
+    assert list(split_views(names(views), conf).test) == expected
+
+
+@given(st.integers(2, 200), CHANGES)
+def test_the_split_is_a_function_of_its_config(
+    configured: Make, views: int, changes: dict[str, Any]
+) -> None:
+    assert split_views(names(views), configured(**changes)) == split_views(
+        names(views), configured(**changes)
+    )
+
+
+def test_another_seed_chooses_other_views_and_holds_out_the_same(configured: Make) -> None:
+    a, b = split_views(names(40), configured()), split_views(names(40), configured(seed=1))
+    assert a.test == b.test == (0, 8, 16, 24, 32)
+    assert a.hr != b.hr
+
+
+def test_a_uniform_selection_is_evenly_spaced(configured: Make) -> None:
+    conf = configured(selection="uniform", test_every=0, hr_fraction=0.25, min_hr=0)
+    assert split_views(names(16), conf).hr == (2, 6, 10, 14)
+
+
+scored = st.lists(st.floats(0.01, 1), min_size=2, max_size=60, unique=True)
+
+
+@pytest.fixture(scope="module")
+def by_rate(configured: Make) -> Make:
+    return partial(configured, tags="sampling_rate", min_hr=0)
+
+
+@given(scored, st.floats(0, 1))
+def test_of_scored_views_the_best_share_is_hr(
+    by_rate: Make, scores: list[float], fraction: float
+) -> None:
+    """Test views (every 2nd) are never among them, however good."""
+    conf = by_rate(hr_fraction=fraction, test_every=2)
+    train = range(1, len(scores), 2)
+    count = round(fraction * len(train))
+    if 0 < fraction < 1 and count in (0, len(train)):
+        with pytest.raises(XrgsError, match=r"variant\.hr_fraction"):
+            split_views(names(len(scores)), conf, scores)
+        return
+    parts = split_views(names(len(scores)), conf, scores)
+    best = sorted(train, key=lambda i: scores[i], reverse=True)[:count]
+    assert parts.hr == tuple(sorted(best))
+    assert parts.lr == tuple(i for i in train if i not in best)
+
+
+def test_views_of_equal_score_are_of_one_class(by_rate: Make) -> None:
+    conf = by_rate(hr_fraction=0.5, test_every=0)
+    assert split_views(names(6), conf, [1, 0.5, 0.5, 0.5, 0.5, 0.2]).hr == (0, 1, 2, 3, 4)
+
+
+def test_a_view_without_a_score_is_lr_and_not_counted(by_rate: Make) -> None:
+    conf = by_rate(hr_fraction=0.5, test_every=0)
+    assert split_views(names(5), conf, [0.5, float("nan"), 1, float("nan"), float("nan")]).hr == (
+        2,
+    )
+
+
+def test_a_threshold_of_the_score_is_inclusive(by_rate: Make) -> None:
+    conf = by_rate(hr_above=0.75, test_every=0)
+    assert split_views(names(4), conf, [1, 0.75, 0.7499, 0.1]).hr == (0, 1)
+
+
+def test_one_factor_brings_the_longest_side_to_long_side(configured: Make) -> None:
+    sizes = [(2000, 1500), (1000, 4000), (640, 480)]
+    assert shrink_factor(sizes, 1000) == 0.25
+    assert shrink_factor(sizes, 0) == 1
+    assert shrink_factor(sizes, 9000) == 1
+
+
+@given(st.integers(60, 5000), st.integers(60, 5000), st.integers(0, 3000), st.integers(1, 8))
+def test_an_hr_view_is_a_whole_number_of_lr_pixels_and_never_enlarged(
+    configured: Make, width: int, height: int, side: int, factor: int
+) -> None:
+    conf = configured(long_side=side, factor=factor)
+    shrink = min(1, (side or max(width, height)) / max(width, height))
+    if min(round(width * shrink), round(height * shrink)) // factor < WINDOW:
+        with pytest.raises(XrgsError, match=r"variant\.factor"):
+            hr_geometry((width, height), shrink_factor([(width, height)], conf.long_side), conf)
+        return
+    made = hr_geometry((width, height), shrink_factor([(width, height)], conf.long_side), conf)
+    assert made.width % factor == made.height % factor == 0
+    assert made.width <= made.resized[0] <= width
+    assert made.height <= made.resized[1] <= height
+    assert made.resized[0] - made.width < factor
+    assert max(made.resized) == min(side or 10**9, max(width, height))
+    left, top = made.crop_offset
+    assert abs(made.resized[0] - made.width - 2 * left) <= 1
+    assert abs(made.resized[1] - made.height - 2 * top) <= 1
+
+
+def test_a_factor_too_large_for_the_ssim_window_is_named(configured: Make) -> None:
+    with pytest.raises(XrgsError, match=r"variant\.factor=40: LR views of 12x9 px .*SSIM window"):
+        hr_geometry((504, 378), 1.0, configured(factor=40))
+
+
+@pytest.mark.parametrize(
+    ("change", "key"),
+    [
+        ({"factor": 0}, "variant.factor=0"),
+        ({"hr_fraction": 1.5}, "variant.hr_fraction=1.5"),
+        ({"min_hr": -1}, "variant.min_hr=-1"),
+        ({"long_side": -1}, "variant.long_side=-1"),
+        ({"test_every": 1}, "variant.test_every=1"),
+        ({"selection": "best"}, "variant.selection=best"),
+        ({"tags": "best"}, "variant.tags=best"),
+        ({"tags": "distance", "hr_above": 1.5}, "variant.hr_above=1.5"),
+        ({"hr_above": 0.5}, "variant.hr_above=0.5: not read with variant.tags=flag"),
+        ({"degradation": "blur"}, "variant.degradation=blur"),
+        ({"jpeg_quality": 0}, "variant.jpeg_quality=0"),
+        ({"jpeg_quality": 96}, "variant.jpeg_quality=96"),
+        ({"phone": PhoneConf(blur=-0.1, noise=0, jpeg_quality=75)}, "variant.phone.blur=-0.1"),
+        ({"phone": PhoneConf(blur=nan, noise=0, jpeg_quality=75)}, "variant.phone.blur=nan"),
+        ({"phone": PhoneConf(blur=0, noise=256, jpeg_quality=75)}, "variant.phone.noise=256"),
+        ({"phone": PhoneConf(blur=0, noise=0, jpeg_quality=0)}, "variant.phone.jpeg_quality=0"),
+        ({"sfm": {"camera": "both"}}, "variant.sfm.camera=both"),
+        ({"sfm": {"first_octave": -2}}, "variant.sfm.first_octave=-2"),
+        ({"sfm": {"min_inliers": 5}}, "variant.sfm.min_inliers=5"),
+        ({"sfm": {"lr_images": "raw"}}, "variant.sfm.lr_images=raw"),
+        ({"sfm": {"min_registered": 2}}, "variant.sfm.min_registered=2"),
+        ({"sfm": {"max_num_features": -1}}, "variant.sfm.max_num_features=-1"),
+    ],
+)
+def test_an_invalid_config_is_refused_by_its_key(
+    configured: Make, change: dict[str, Any], key: str
+) -> None:
+    with pytest.raises(XrgsError, match=key):
+        check_variant_conf(configured(**change))
+    check_variant_conf(configured())
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"factor": 1},
+        {"hr_fraction": 0.0},
+        {"hr_fraction": 1.0},
+        {"min_hr": 0},
+        {"long_side": 0},
+        {"test_every": 0},
+        {"test_every": 2},
+        {"selection": "random"},
+        {"selection": "uniform"},
+        {"tags": "flag", "hr_above": 0.0},
+        {"tags": "megapixels", "hr_above": 0.5},
+        {"tags": "distance", "hr_above": 1.0},
+        {"tags": "sampling_rate"},
+        *({"degradation": d} for d in ("auto", "none", *DEGRADATIONS)),
+        {"phone": PhoneConf(blur=0, noise=0, jpeg_quality=1)},
+        {"phone": PhoneConf(blur=10, noise=255, jpeg_quality=95)},
+        {"jpeg_quality": 1},
+        {"jpeg_quality": 95},
+        {"sfm": {"lr_images": "upsampled"}},
+        {"sfm": {"lr_images": "native"}},
+        {"sfm": {"min_registered": 0.0}},
+        {"sfm": {"min_registered": 1.0}},
+        {"sfm": {"max_num_features": 0}},
+        *({"sfm": {"camera": c}} for c in ("auto", "single", "per_image")),
+        *({"sfm": {"first_octave": o}} for o in (None, -1, 0)),
+        {"sfm": {"min_inliers": 6}},
+    ],
+)
+def test_every_documented_value_and_limit_is_accepted(
+    configured: Make, change: dict[str, Any]
+) -> None:
+    check_variant_conf(configured(**change))
+
+
+def test_named_views_are_held_out_in_place_of_every_nth(configured: Make) -> None:
+    conf = configured(test=["view_005", "view_002"], test_every=3)
+    parts = split_views(names(9), conf)
+    assert parts.test == (2, 5)
+    assert sorted(parts.hr + parts.lr) == [0, 1, 3, 4, 6, 7, 8]
+
+
+def test_an_unknown_test_view_is_refused_with_the_nearest_name(configured: Make) -> None:
+    check_test_names(names(9), configured(test=["view_004"]))
+    message = r"variant\.test: the scene has no view view_04\.png; did you mean view_004\?"
+    with pytest.raises(XrgsError, match=message):
+        check_test_names(names(9), configured(test=["view_003", "view_04.png"]))
+
+
+@pytest.mark.parametrize(
+    ("given", "names", "word"),
+    [
+        (["a", "b"], ["a,b", "c"], "'variant.test=[\"a,b\"]'"),
+        (["c", "a", "b", "d"], ["a, b", "c", "d"], '\'variant.test=["c","a, b","d"]\''),
+        (["1007100"], ["100_7100"], "'variant.test=[\"100_7100\"]'"),
+        (["q"], ["aq", "'q'"], """'variant.test=["'"'"'q'"'"'"]'"""),
+        (["True"], ["true", "a"], "'variant.test=[\"true\"]'"),
+    ],
+)
+def test_a_name_that_needs_quotes_is_answered_with_the_word_to_type(
+    configured: Make, given: list[str], names: list[str], word: str
+) -> None:
+    with pytest.raises(XrgsError) as caught:
+        check_test_names(names, configured(test=given))
+    assert f" On a command line it is {word}, in a file of YAML test: [" in str(caught.value)

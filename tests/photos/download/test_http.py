@@ -1,0 +1,311 @@
+"""Downloads that are resumed, tried again and verified, from a server that cuts and refuses."""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import io
+import random
+import socket
+from pathlib import Path
+from typing import Any
+from urllib.request import Request
+
+import pytest
+
+from xrgs.photos.download import http
+from xrgs.photos.download.http import DownloadError, download
+
+CONTENT = random.Random(0).randbytes(700_000)
+#: The largest size that is accepted: exactly the content's.
+MOST = len(CONTENT)
+SHA256 = hashlib.sha256(CONTENT).hexdigest()
+
+
+@pytest.fixture
+def target(tmp_path: Path) -> Path:
+    return tmp_path / "made" / "scenes.zip"
+
+
+@pytest.fixture
+def part(server: Any, target: Path) -> Path:
+    """The first 300,000 bytes, as an interrupted download leaves them."""
+    server.content, server.cuts = CONTENT, [300_000] + [0] * http._TRIES
+    with pytest.raises(DownloadError, match=r"ended after 300000 of 700000.*zip\.part has 300000"):
+        download(server.url, target, MOST)
+    assert len(server.asked) == 1 + http._TRIES
+    assert not target.exists()
+    server.asked.clear()
+    return target.with_name("scenes.zip.part")
+
+
+def answer(status: str, body: bytes = b"", **headers: str) -> bytes:
+    """The bytes of an answer; underscores in the names of headers stand for hyphens."""
+    lines = [f"{name.replace('_', '-')}: {value}" for name, value in headers.items()]
+    return "\r\n".join([f"HTTP/1.1 {status}", *lines, "", ""]).encode() + body
+
+
+@pytest.mark.parametrize("sha256", ["", SHA256, SHA256.upper()])
+def test_a_lost_connection_is_resumed(server: Any, target: Path, sha256: str) -> None:
+    server.content, server.cuts = CONTENT, [300_000, 1000]
+    download(server.url, target, MOST, sha256)
+    assert target.read_bytes() == CONTENT
+    assert [file.name for file in target.parent.iterdir()] == ["scenes.zip"]
+    assert server.asked == [None, "bytes=300000-", "bytes=301000-"]
+
+
+def test_an_interrupted_download_is_continued(server: Any, target: Path, part: Path) -> None:
+    assert part.read_bytes() == CONTENT[:300_000]
+    download(server.url, target, MOST)
+    assert target.read_bytes() == CONTENT
+    assert server.asked == ["bytes=300000-"]
+
+
+def test_a_file_that_changed_is_downloaded_from_its_beginning(
+    server: Any, target: Path, part: Path
+) -> None:
+    server.content, server.etag = CONTENT[::-1], '"second"'
+    download(server.url, target, MOST)
+    assert target.read_bytes() == CONTENT[::-1]
+
+
+def test_a_part_from_another_address_is_not_continued(
+    server: Any, target: Path, part: Path
+) -> None:
+    download(server.url + "?v=2", target, MOST)
+    assert target.read_bytes() == CONTENT
+    assert server.asked == [None]
+
+
+def test_a_part_of_unknown_origin_is_not_continued(server: Any, target: Path) -> None:
+    server.content = CONTENT
+    target.parent.mkdir()
+    target.with_name("scenes.zip.part").write_bytes(b"x" * 1000)
+    download(server.url, target, MOST)
+    assert target.read_bytes() == CONTENT
+
+
+def test_a_server_without_ranges_begins_again(server: Any, target: Path, part: Path) -> None:
+    server.ranges = False
+    download(server.url, target, MOST)
+    assert target.read_bytes() == CONTENT
+
+
+def test_a_part_longer_than_the_file_is_discarded(server: Any, target: Path, part: Path) -> None:
+    part.write_bytes(CONTENT + b"more")
+    download(server.url, target, MOST)
+    assert target.read_bytes() == CONTENT
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {},
+        {"Content_Range": "bytes 5-699999/700000"},
+        {"Content_Range": "bytes 300000-699999/*"},
+        {"Content_Range": "bytes 300000-699999/700000", "ETag": '"second"'},
+    ],
+    ids=str,
+)
+def test_a_range_that_does_not_continue_the_part_is_not_appended(
+    server: Any, target: Path, part: Path, headers: dict[str, str]
+) -> None:
+    server.answers = [answer("206 Partial Content", b"x" * 400_000, **headers)]
+    download(server.url, target, MOST)
+    assert target.read_bytes() == CONTENT
+
+
+@pytest.mark.parametrize(
+    ("headers", "asked"),
+    [
+        ({"ETag": '"a"'}, "bytes=100-"),
+        ({"Last_Modified": "Wed, 01 Jan 2020 10:00:00 GMT"}, "bytes=100-"),
+        ({"ETag": 'W/"a"'}, None),
+        ({}, None),
+    ],
+    ids=str,
+)
+def test_a_part_is_continued_only_if_its_version_is_known(
+    server: Any, target: Path, headers: dict[str, str], asked: str | None
+) -> None:
+    server.content = CONTENT
+    server.answers = [answer("200 OK", CONTENT[:100], Content_Length=str(MOST), **headers)]
+    download(server.url, target, MOST)
+    assert target.read_bytes() == CONTENT
+    assert server.asked == [None, asked]
+
+
+CHUNKS = b"".join(b"%x\r\n%b\r\n" % (len(c), c) for c in (CONTENT[:9], CONTENT[9:]))
+
+
+def test_chunks_are_a_file_once_the_last_one_came(server: Any, target: Path) -> None:
+    cut, whole = (
+        answer("200 OK", body, Transfer_Encoding="chunked") for body in (CHUNKS, CHUNKS + b"0\r\n")
+    )
+    server.answers = [cut, cut[:5000], whole]
+    download(server.url, target, MOST)
+    assert target.read_bytes() == CONTENT
+    assert len(server.asked) == 3
+
+
+@pytest.mark.parametrize("cuts", [[3] * 99, [200_000, 10] * 50])
+def test_a_server_that_brings_nothing_new_is_given_up(
+    server: Any, target: Path, cuts: list[int]
+) -> None:
+    server.content, server.ranges, server.cuts = CONTENT, False, cuts
+    with pytest.raises(DownloadError, match=r"ended after \d+ of 700000 bytes"):
+        download(server.url, target, MOST)
+    assert len(server.asked) <= 1 + http._TRIES
+
+
+def test_a_slow_server_is_given_up(
+    server: Any, target: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(http, "_PERIOD_S", 0.3)
+    monkeypatch.setattr(http, "_TRIES", 1)
+    server.content, server.drips = CONTENT, True
+    with pytest.raises(DownloadError, match=r"fewer than 60000 bytes in 0\.3 s"):
+        download(server.url, target, MOST)
+
+
+def test_another_content_is_not_kept(server: Any, target: Path) -> None:
+    server.content = CONTENT[:-1] + b"?"
+    with pytest.raises(DownloadError, match=f"sha256 is [0-9a-f]{{64}}, expected {SHA256}"):
+        download(server.url, target, MOST, SHA256)
+    assert list(target.parent.iterdir()) == []
+
+
+@pytest.mark.parametrize("chunked", [False, True])
+def test_bytes_beyond_the_limit_are_not_written(server: Any, target: Path, chunked: bool) -> None:
+    server.content = CONTENT
+    if chunked:
+        server.answers = [answer("200 OK", CHUNKS, Transfer_Encoding="chunked")]
+    with pytest.raises(DownloadError, match=rf"{server.url}: \d+ bytes .* at most {MOST - 1} are"):
+        download(server.url, target, MOST - 1)
+    assert not target.exists()
+    assert target.with_name("scenes.zip.part").stat().st_size < MOST
+
+
+@pytest.mark.parametrize(
+    ("sent", "why"),
+    [
+        (answer("404 Not\x1b Found"), "the server says 404 Not  Found"),
+        (answer("403 Forbidden"), "the server says 403 Forbidden"),
+        (answer("302 Found"), "the server says 302"),
+        (answer("200 OK", b"<html>", Content_Type="text/html; charset=utf-8"), "a web page"),
+    ],
+)
+def test_a_refusal_is_not_repeated(server: Any, target: Path, sent: bytes, why: str) -> None:
+    server.answers = [sent]
+    with pytest.raises(DownloadError, match=rf"{server.url}: .*{why}"):
+        download(server.url, target, MOST)
+    assert len(server.asked) == 1
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [answer("503 Busy"), answer("429 Slowly"), b"", b"HTTP/1.1 200 O", b"nonsense\r\n\r\n"],
+    ids=str,
+)
+def test_a_server_in_trouble_is_asked_again_after_growing_pauses(
+    server: Any, target: Path, pauses: list[float], sent: bytes
+) -> None:
+    server.content, server.answers = CONTENT, [sent] * (http._TRIES - 1)
+    download(server.url, target, MOST)
+    assert target.read_bytes() == CONTENT
+    assert pauses == [1, 2, 4, 8, 16]
+
+
+def test_an_unreachable_server_is_named(target: Path, pauses: list[float]) -> None:
+    with socket.socket() as held:
+        held.bind(("127.0.0.1", 0))  # it does not listen, and nobody else can
+        url = f"http://127.0.0.1:{held.getsockname()[1]}/x.zip"
+        with pytest.raises(
+            DownloadError, match=rf"{url}: can't be downloaded \(Connection refused\)$"
+        ):
+            download(url, target, MOST)
+    assert len(pauses) == http._TRIES - 1
+
+
+def test_a_second_process_does_not_append_to_the_same_file(
+    server: Any, target: Path, part: Path
+) -> None:
+    with part.open("ab") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        with pytest.raises(DownloadError, match=r"scenes\.zip: another process"):
+            download(server.url, target, MOST)
+    assert server.asked == []
+
+
+def test_a_part_that_has_become_the_file_meanwhile_is_not_appended_to(
+    server: Any, target: Path, part: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The process that held the lock renames the part after this one has opened it."""
+    monkeypatch.setattr(fcntl, "flock", lambda *_: part.rename(target))
+    with pytest.raises(DownloadError, match="there already"):
+        download(server.url, target, MOST)
+    assert target.read_bytes() == CONTENT[:300_000]
+
+
+@pytest.mark.parametrize(
+    ("url", "why"),
+    [
+        ("", "must begin with http"),
+        ("file:///etc/hostname", "must begin with http"),
+        ("http://", "must begin with http"),
+        ("http://[::1/x", "not a valid address"),
+        ("http://127.0.0.1:x/", "not a valid address"),
+        ("http://127.0.0.1/a b", "not a valid address"),
+        (f"http://{'a' * 99}.org/", "not a valid address"),
+    ],
+)
+def test_a_malformed_address_is_refused(
+    target: Path, pauses: list[float], url: str, why: str
+) -> None:
+    with pytest.raises(DownloadError, match=why):
+        download(url, target, MOST)
+    assert pauses == []
+
+
+def test_a_disk_that_can_not_take_it_is_named(server: Any, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(DownloadError, match=r"file/scenes\.zip\.part: can't be written"):
+        download(server.url, tmp_path / "file" / "scenes.zip", MOST)
+
+
+def test_five_redirects_are_followed_and_no_more(server: Any, target: Path) -> None:
+    server.content = CONTENT
+    server.answers = [answer("302 Found", Location=f"/{number}") for number in range(5)]
+    download(server.url, target, MOST)
+    server.answers = [answer("302 Found", Location=f"/{number}") for number in range(6)]
+    with pytest.raises(DownloadError, match="the server says 302"):
+        download(server.url, target.with_name("again"), MOST)
+
+
+@pytest.mark.parametrize(
+    ("url", "location", "why"),
+    [
+        ("http://a.org/x", "http://A.org/y", None),
+        ("http://a.org/x", "https://a.org/y", None),
+        ("http://a.org/x", "http://c.org:8/y", None),
+        ("http://c.org:8/x", "http://a.org/y", None),
+        ("http://a.org/x", "http://b.org/y", "another host"),
+        ("http://a.org/x", "http://a.org:81/y", "another host"),
+        ("http://a.org/x", "http://a.org@b.org/y", "another host"),
+        ("http://a.org/x", "http://b.org\\@a.org/y", "another host"),
+        ("http://a.org/x", "http://a.org.b.org/y", "another host"),
+        ("https://a.org/x", "http://a.org/y", "less safe"),
+        ("http://a.org/x", "ftp://a.org/y", "less safe"),
+    ],
+)
+def test_where_a_redirect_may_lead(url: str, location: str, why: str | None) -> None:
+    handler = http._RedirectHandler("http://a.org/x", ["C.org:8"])
+    request = Request(url)  # noqa: S310  nothing is opened
+    arguments: Any = (request, io.BytesIO(), 302, "Found", {}, location)
+    if why is None:
+        followed = handler.redirect_request(*arguments)
+        assert followed is not None
+        assert followed.full_url == location
+    else:
+        with pytest.raises(DownloadError, match=rf"http://a.org/x: .*not followed \({why}"):
+            handler.redirect_request(*arguments)

@@ -1,0 +1,173 @@
+"""Scenes of every kind: their photographs, names and fingerprints."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.photos.scene_confs import scene_conf
+from xrgs.config import SceneConf
+from xrgs.errors import XrgsError
+from xrgs.photos import images, scenes
+from xrgs.photos.scenes import procedural
+from xrgs.photos.scenes.scene import bundled_photograph
+
+Fill = Callable[..., SceneConf]
+PROCEDURAL = scene_conf("procedural", name="procedural", views=3)
+
+
+def stems(scene: scenes.Scene) -> list[str]:
+    return list(scene.files)
+
+
+def test_a_folder_is_its_images_sorted_by_name(fill: Fill, tmp_path: Path) -> None:
+    conf = fill(tmp_path / "my scene é", "b 1.png", "ä.JPG", "a,2.jpeg")
+    (tmp_path / "my scene é" / "notes.txt").write_text("no image")
+    (tmp_path / "my scene é" / ".hidden.png").write_bytes(b"")
+    scene = scenes.resolve(conf, tmp_path / "cache")
+    assert stems(scene) == ["a,2", "b 1", "ä"]
+    assert scene.name == scenes.label(conf) == "my scene é"
+    assert not scene.intrinsics
+    assert not scene.viewmats
+    assert not (tmp_path / "cache").exists()
+
+
+def test_a_given_name_wins_over_the_folders(fill: Fill, tmp_path: Path) -> None:
+    conf = replace(fill(tmp_path / "x", "a.png", "b.png"), name="garden")
+    assert scenes.resolve(conf, tmp_path).name == "garden"
+
+
+def test_the_fingerprint_follows_names_and_bytes_alone(fill: Fill, tmp_path: Path) -> None:
+    conf = fill(tmp_path / "x", "a.png", "b.png")
+    first = scenes.fingerprint(conf)
+    moved = fill(tmp_path / "y", "a.png", "b.png")
+    assert scenes.fingerprint(moved) == first
+    assert scenes.fingerprint(replace(conf, name="other")) == first
+    (tmp_path / "y" / "b.png").rename(tmp_path / "y" / "c.png")
+    assert scenes.fingerprint(moved) != first
+    bytes_ = bytearray((tmp_path / "x" / "a.png").read_bytes())
+    bytes_[-1] ^= 1
+    (tmp_path / "x" / "a.png").write_bytes(bytes_)
+    assert scenes.fingerprint(conf) != first
+
+
+def test_an_unknown_kind_names_the_key(tmp_path: Path) -> None:
+    with pytest.raises(XrgsError, match=r"scene.kind=llff: must be one of procedural"):
+        scenes.resolve(scene_conf("llff", tmp_path, name="x"), tmp_path)
+
+
+def test_the_procedural_scene_is_rendered_once(tmp_path: Path) -> None:
+    first = scenes.resolve(PROCEDURAL, tmp_path, 60)
+    assert stems(first) == ["view_000", "view_001", "view_002"]
+    assert images.size(next(iter(first.files.values()))) == (60, 45)
+    assert first.viewmats.keys() == set(stems(first))
+    assert not first.intrinsics  # SfM is to find them, as in a real capture
+    times = [file.lstat().st_mtime_ns for file in first.files.values()]
+    again = scenes.resolve(PROCEDURAL, tmp_path, 60)
+    assert [file.lstat().st_mtime_ns for file in again.files.values()] == times
+    assert [p.name for p in tmp_path.iterdir() if p.name[0] != "."] == [first.fingerprint]
+
+
+def test_other_images_do_not_become_the_procedural_scene(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    first = scenes.resolve(PROCEDURAL, tmp_path, 60)
+    genuine = list(first.files.values())[1].read_bytes()
+    images.save(list(first.files.values())[1], np.full((45, 60, 3), (1, 0, 0), np.float32))
+    again = scenes.resolve(PROCEDURAL, tmp_path, 60)
+    assert list(again.files.values())[1].read_bytes() == genuine
+    assert "view_001.png: it has changed" in caplog.text
+
+
+def test_a_label_is_one_printable_line(tmp_path: Path) -> None:
+    for name, path, shown in (
+        ("a\n\x1b[31mb", None, "a  [31mb"),
+        ("\n", None, "procedural"),
+        ("", str(tmp_path / "a\tb"), "a b"),
+    ):
+        assert scenes.label(replace(PROCEDURAL, name=name, path=path)) == shown
+    assert len(scenes.label(replace(PROCEDURAL, name="x" * 9_999))) == 200
+
+
+def test_two_processes_that_render_at_once_get_one_complete_scene(tmp_path: Path) -> None:
+    with ThreadPoolExecutor(2) as pool:
+        found = list(pool.map(lambda _: scenes.resolve(PROCEDURAL, tmp_path, 60), range(2)))
+    assert found[0].files == found[1].files
+    assert all(images.read(file).shape == (45, 60, 3) for file in found[0].files.values())
+    assert [p.name for p in tmp_path.iterdir() if p.name[0] != "."] == [found[0].fingerprint]
+
+
+@pytest.mark.parametrize("name", [file for file, _ in procedural.TEXTURES.values()])
+def test_the_photographs_are_in_the_installed_wheel(name: str) -> None:
+    assert images.read(bundled_photograph(name)).ndim == 3
+
+
+def test_a_photograph_that_the_wheel_lacks_is_named() -> None:
+    with pytest.raises(XrgsError, match=r"nothing\.png"):
+        bundled_photograph("nothing.png")
+
+
+def test_size_and_number_of_views_are_in_the_fingerprint() -> None:
+    marks = {
+        scenes.fingerprint(PROCEDURAL, 60),
+        scenes.fingerprint(PROCEDURAL, 64),
+        scenes.fingerprint(replace(PROCEDURAL, views=4), 60),
+        scenes.fingerprint(scene_conf("motorcycle", name="motorcycle"), 60),
+    }
+    assert len(marks) == 4
+    full = scenes.fingerprint(PROCEDURAL, procedural.FULL_SIDE)
+    assert scenes.fingerprint(PROCEDURAL, 0) == full
+
+
+def test_one_view_is_too_few(tmp_path: Path) -> None:
+    with pytest.raises(XrgsError, match=r"scene\.views=1"):
+        scenes.resolve(replace(PROCEDURAL, views=1), tmp_path)
+
+
+def test_what_becomes_of_alpha_is_in_the_fingerprint() -> None:
+    mask = replace(PROCEDURAL, alpha="mask")
+    white = replace(PROCEDURAL, background=(1.0, 1.0, 1.0))
+    assert len({scenes.fingerprint(conf, 60) for conf in (PROCEDURAL, mask, white)}) == 3
+    with pytest.raises(XrgsError, match=r"scene\.alpha=none: must be one of composite, mask"):
+        scenes.fingerprint(replace(PROCEDURAL, alpha="none"))
+    with pytest.raises(XrgsError, match=r"scene\.background=\[0, 0, 255\]: values must be 0 to 1"):
+        scenes.fingerprint(replace(PROCEDURAL, background=(0, 0, 255)))
+
+
+def test_alpha_and_background_reach_the_scene(fill: Fill, tmp_path: Path) -> None:
+    conf = replace(fill(tmp_path / "x", "a.png", "b.png"), alpha="mask", background=(1, 0, 0.5))
+    scene = scenes.resolve(conf, tmp_path)
+    assert (scene.alpha, scene.background) == ("mask", (1, 0, 0.5))
+
+
+def test_fingerprints_need_neither_torch_nor_scikit_image() -> None:
+    script = (
+        "import sys; from xrgs.photos import scenes; from xrgs.composing import compose;"
+        "scenes.fingerprint(compose('scene=procedural').scene, 100);"
+        "scenes.fingerprint(compose('scene=motorcycle').scene);"
+        "print(sorted({'torch', 'skimage', 'pycolmap'} & set(sys.modules)))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", script], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == "[]"
+
+
+def test_folders_called_images_have_the_name_of_the_folder_around_them(tmp_path: Path) -> None:
+    for path in ("pa/images", "pb/images", "pa/other", "pb/other"):
+        (tmp_path / path).mkdir(parents=True)
+
+    def confs(*paths: str) -> list[SceneConf]:
+        return [scene_conf("folder", tmp_path / path) for path in paths]
+
+    assert [scenes.label(conf) for conf in confs("pa/images", "pb/images")] == ["pa", "pb"]
+    scenes.check_labels(confs("pa/images", "pb/images", "pa/images"))
+    with pytest.raises(XrgsError, match=r"pa/other and .*pb/other: both are called other"):
+        scenes.check_labels(confs("pa/other", "pb/other"))

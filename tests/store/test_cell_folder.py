@@ -1,0 +1,99 @@
+"""Tests of a cell's folder: its state and its results."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.store.cells import SCORES, SUMMARY, identity
+from xrgs.safeio.atomic import write_json
+from xrgs.store.attempts import plan_cell
+from xrgs.store.cell_folder import CellFolder
+
+
+def test_a_finished_cell_is_done_and_gives_back_what_was_written(done: CellFolder) -> None:
+    assert done.state().name == "done"
+    assert done.summary() == SUMMARY
+    assert done.identity() == identity()
+    assert done.config().scene.name == "motorcycle"
+    assert done.history()["loss"].tolist() == [0.5]
+
+
+def test_declaring_a_cell_done_twice_keeps_it_done(done: CellFolder) -> None:
+    done.finish(["a", "b"], {})
+    assert done.state().name == "done"
+
+
+def test_a_cell_without_status_is_unfinished_planned_or_absent(done: CellFolder) -> None:
+    done.status_file.unlink()
+    assert done.state().name == "unfinished"
+    other = CellFolder(done.path.with_name("other"))
+    assert other.state().name == "absent"
+    plan_cell(other, done.config(), identity())
+    assert other.state().name == "planned"
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("scores.csv", SCORES.replace("20.5", "99.5")),
+        ("scores.csv", "view,psnr,ssim,lpips\na,20.5,0.75,\n"),
+        ("config.json", '{"seed": 1}'),
+        ("identity.json", '{\n "seed": 1\n}\n'),
+        ("history.csv", "step,view,gaussians,loss\n0,c,7,0.7\n"),  # of the same size
+        ("summary.json", "{}"),
+        ("renders/a.png", "12345"),
+        ("status.json", "{"),
+        ("status.json", '{"state": "finished"}'),
+        ("status.json", "[]"),
+    ],
+)
+def test_a_cell_that_was_changed_is_corrupt(done: CellFolder, name: str, content: str) -> None:
+    (done.path / name).write_text(content)
+    assert done.state().name == "corrupt"
+    assert done.state().reason
+
+
+@pytest.mark.parametrize("views", [["a"], ["a", "c"], ["b", "a"], ["a", "b", "b"]])
+def test_scores_of_other_views_than_planned_are_corrupt(done: CellFolder, views: list[str]) -> None:
+    done.finish(views, {})
+    assert done.state().name == "corrupt"
+    assert "one row for each view" in done.state().reason
+    assert done.state(verify=False).name == "done"  # sizes alone do not show it
+
+
+def test_the_state_of_a_cell_in_training_names_its_owner(done: CellFolder) -> None:
+    assert done.running("process 7 on host").reason == "by process 7 on host"
+    write_json(
+        done.progress, {"what": "training", "unit": "step", "done": 5, "total": 10, "rate": None}
+    )
+    state = done.running("process 7 on host")
+    assert (state.name, state.reason) == ("running", "by process 7 on host: training 5 of 10 steps")
+
+
+def test_a_missing_file_is_named(done: CellFolder) -> None:
+    (done.path / "renders" / "a.png").unlink()
+    state = done.state()
+    assert state.name == "corrupt"
+    assert "renders/a.png" in state.reason
+
+
+def test_a_failed_cell_says_why(done: CellFolder) -> None:
+    done.fail("out of luck")
+    assert done.state().name == "failed"
+    assert done.state().reason == "out of luck"
+
+
+def test_a_finished_cell_has_no_checkpoint(stopped: CellFolder) -> None:
+    stopped.finish(["a", "b"], {})
+    stopped.progress.unlink()  # of a process that has ended: no result
+    assert stopped.state().name == "done"
+    assert not stopped.checkpoint.exists()
+    stopped.checkpoint.write_bytes(b"killed before it was removed")
+    assert stopped.state().name == "done"
+
+
+def test_new_scores_of_a_done_cell_are_part_of_it(done: CellFolder) -> None:
+    (done.path / "scores.csv").write_text(SCORES.replace("20.5", "21.5"))
+    done.rescored(["scores.csv"], {"psnr": "4567"})
+    assert done.state().name == "done"
+    assert done.status().scored_by == {"psnr": "4567"}

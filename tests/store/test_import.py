@@ -1,0 +1,515 @@
+"""The border of a store: a store of somebody else is imported whole, or left out and named."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import re
+import shutil
+import tarfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.store.cells import finished, identity, row, write_variant
+from xrgs.errors import StoreError
+from xrgs.safeio.atomic import write_json
+from xrgs.safeio.files import list_names
+from xrgs.safeio.hashing import digest, file_digest
+from xrgs.store import archive
+from xrgs.store.archive import Imported, import_store, pack
+from xrgs.store.cell_folder import CellFolder
+from xrgs.store.identity import cell_id
+from xrgs.store.store import Store
+
+SCENE = "fedcba9876543210"
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory: pytest.TempPathFactory) -> Store:
+    """A store with a done cell, its variant, a rendered scene and the record of a sweep."""
+    store = Store(tmp_path_factory.mktemp("original") / "xrgs-store")
+    store.prepare()
+    what = identity(0, write_variant(store.variants))
+    finished(store.cell(cell_id(what)), what=what)
+    scene = store.scenes / SCENE
+    scene.mkdir()
+    (scene / "v0.png").write_bytes(b"image")
+    content = {"fingerprint": SCENE, "files": {"v0.png": file_digest(scene / "v0.png")}}
+    write_json(scene / "scene.json", content)
+    store.write_sweep(["a"], [row(cell_id(what))])
+    return store
+
+
+@pytest.fixture
+def foreign(original: Store, tmp_path: Path) -> Store:
+    """A copy of that store, to be damaged."""
+    shutil.copytree(original.path, tmp_path / "xrgs-store")
+    return Store(tmp_path / "xrgs-store")
+
+
+@pytest.fixture
+def mine(tmp_path: Path) -> Store:
+    return Store(tmp_path / "mine")
+
+
+def the_cell(store: Store) -> CellFolder:
+    (cell,) = store.cell_folders()
+    return cell
+
+
+def contents(store: Store) -> dict[str, bytes]:
+    files = (path for path in store.path.rglob("*") if path.is_file() or path.is_symlink())
+    return {str(path.relative_to(store.path)): path.read_bytes() for path in files}
+
+
+def packed_as(store: Store, file: Path, mode: Any) -> Path:
+    with tarfile.open(file, mode) as stream:
+        stream.add(store.path, "." if mode == "w" else "xrgs-store")
+    return file
+
+
+@pytest.mark.parametrize("kind", ["folder", "around", ".tar", ".tar.gz", ".tar.xz", ".tar.bz2"])
+def test_a_store_is_imported_whole(foreign: Store, mine: Store, kind: str) -> None:
+    cell = the_cell(foreign)
+    expected = contents(foreign)
+    del expected[f"cells/{cell.id}/log.txt"]
+    for name in ("checkpoint.npz", "progress.json", ".config.json.1-ab"):
+        (cell.path / name).write_text("not imported")
+    for name in ("hydra/a/b.yaml", "reports/x/report.html", "locks/a.0", "cells/a.aside-1/log.txt"):
+        (foreign.path / name).parent.mkdir(parents=True, exist_ok=True)
+        (foreign.path / name).write_text("not imported")
+    source = foreign.path
+    if kind == "around":
+        source = foreign.path.parent / "around"
+        source.mkdir()
+        foreign.path.rename(source / "xrgs-store")
+    elif kind != "folder":
+        mode = {".tar": "w"}.get(kind, f"w:{kind[5:]}")
+        source = packed_as(foreign, foreign.path.parent / f"a{kind}", mode)
+    found = import_store(source, mine)
+    assert found == Imported(1, 1, 1, 1, 0, ())
+    assert str(found) == (
+        "imported: 1 cell, 1 variant, 1 rendered scene, 1 record of sweeps; already there: 0"
+    )
+    assert contents(mine) == expected
+    assert import_store(source, mine) == Imported(0, 0, 0, 0, 4, ())
+    assert contents(mine) == expected
+
+
+def test_what_was_packed_is_imported_and_there_is_no_second_one(
+    foreign: Store, mine: Store, tmp_path: Path
+) -> None:
+    pack(foreign, foreign.cell_folders(), tmp_path / "a.tar.xz", tmp_path)
+    assert import_store(tmp_path / "a.tar.xz", mine) == Imported(1, 1, 0, 1, 0, ())
+    (variant,) = list_names(mine.variants)
+    assert variant.startswith("trimmed-")
+    assert mine.sweep_record().cells == foreign.sweep_record().cells
+    # The variant with its images is the same one, and what is mine is left as it is.
+    assert import_store(foreign.path, mine) == Imported(0, 0, 1, 0, 3, ())
+    assert list_names(mine.variants) == [variant]
+
+
+def test_what_is_mine_does_not_change(foreign: Store, mine: Store) -> None:
+    mine.prepare()
+    cell = mine.cell(the_cell(foreign).id)
+    cell.path.mkdir()
+    (cell.path / "log.txt").write_text("begun")
+    assert import_store(foreign.path, mine) == Imported(0, 1, 1, 1, 1, ())
+    assert list_names(cell.path) == ["log.txt"]
+
+
+# What a file of the store may be instead
+
+
+def link(file: Path) -> str:
+    file.rename(file.parents[3] / ".elsewhere")
+    file.symlink_to(file.parents[3] / ".elsewhere")
+    return "not a regular file"
+
+
+def pipe(file: Path) -> str:
+    file.unlink()
+    os.mkfifo(file)
+    return "not a regular file"
+
+
+def hard_link(file: Path) -> str:
+    """In an archive, the second name of a file is a link to the first."""
+    os.link(file, file.with_name(".first"))
+    return "not a regular file"
+
+
+def remove(file: Path) -> str:
+    file.unlink()
+    return "No such file"
+
+
+def sparse(file: Path) -> str:
+    os.truncate(file, 1 << 35)
+    return f"{1 << 35} bytes, at most"
+
+
+def change(file: Path) -> str:
+    content = file.read_bytes()
+    file.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    return "changed"
+
+
+@pytest.mark.parametrize("name", ["scores.csv", "splats.ply", "renders/a.png", "identity.json"])
+@pytest.mark.parametrize("attack", [link, pipe, hard_link, remove, sparse, change])
+def test_a_cell_with_another_file_is_left_out(
+    foreign: Store, mine: Store, name: str, attack: Callable[[Path], str]
+) -> None:
+    cell = the_cell(foreign)
+    why, source = attack(cell.path / name), foreign.path
+    if attack is hard_link:
+        source = packed_as(foreign, foreign.path.parent / "a.tar", "w")
+    began = time.monotonic()
+    found = import_store(source, mine)
+    assert time.monotonic() - began < 20
+    assert (found.cells, found.variants, found.scenes, found.sweeps) == (0, 1, 1, 1)
+    (line,) = found.left_out
+    assert line.startswith(f"cells/{cell.id}: ")
+    assert name in line
+    assert why in line
+    assert list_names(mine.cells_folder) == []
+
+
+SCENE_CONF = b'{"name": "", "kind": "folder", "path": "x", "views": 2}'
+BILLION = b"[" + b"[[]]," * 700_000 + b"[]]"
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "why"),
+    [
+        ("status.json", b'{"state": "failed", "reason": "x"}', "the cell has failed"),
+        ("status.json", b"{", "not valid JSON"),
+        ("status.json", BILLION, "Expected `object`"),
+        ("status.json", b"[" * 1_000_000, "not valid JSON|Expected `object`"),
+        ("status.json", b'{"state": "done", "files": {"../x": {"bytes": 1}}}', "key in files"),
+        ("status.json", b'{"state": "done"}', r"config\.json is not listed"),
+        ("identity.json", b'{"variant": "v", "seed": NaN}', "identity.json: not valid JSON"),
+        ("identity.json", b'{"variant": "../v"}', "identity.json: variant: not a name"),
+        ("identity.json", BILLION, "identity.json: the file: Expected `object`"),
+        ("summary.json", b'{"training_time_s": 1e99}', "summary.json: training_time_s"),
+        ("provenance.json", b'{"xrgs": 3}', "provenance.json: xrgs"),
+        ("config.json", b'{"scene": %s, "seed": "0"}' % SCENE_CONF, "config.json: seed"),
+        (
+            "config.json",
+            b'{"scene": %s, "lpips": {"fetch": true}, "components": {"plugins": {"os": 3}}}'
+            % SCENE_CONF,
+            "components.plugins.os",
+        ),
+        ("scores.csv", b"view,psnr\n../a,3\n", "scores.csv"),
+        ("scores.csv", b"view,psnr\na,1e99\nb,1\n", "out of range"),
+        ("history.csv", b"step,step\n1,1\n", "history.csv: the header"),
+    ],
+)
+def test_a_cell_with_a_damaged_file_is_left_out(
+    foreign: Store, mine: Store, file: str, content: bytes, why: str
+) -> None:
+    """Its status has the right hash of the file."""
+    cell = the_cell(foreign)
+    (cell.path / file).write_bytes(content)
+    if file != "status.json":
+        seal(cell)
+    found = import_store(foreign.path, mine)
+    (line,) = found.left_out
+    assert line.startswith(f"cells/{cell.id}: ")
+    assert found.cells == 0
+    assert re.search(why, line)
+
+
+def seal(cell: CellFolder) -> None:
+    """Let a cell's status list its files as they are now."""
+    cell.finish(["a", "b"], {})
+
+
+def test_a_cell_of_another_identity_is_left_out(foreign: Store, mine: Store) -> None:
+    cell = the_cell(foreign)
+    text = (cell.path / "identity.json").read_text()
+    (cell.path / "identity.json").write_text(text.replace('"seed": 0', '"seed": 1'))
+    seal(cell)
+    (line,) = import_store(foreign.path, mine).left_out
+    why = (
+        "its digest is not the id of the cell: the file has changed, or the cell is of version 0.1"
+    )
+    assert line.startswith(f"cells/{cell.id}: identity.json: {why}")
+
+
+def test_a_component_that_a_config_names_is_not_imported(
+    foreign: Store, mine: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "evil_plugin.py").write_text("raise SystemExit('imported')")
+    monkeypatch.syspath_prepend(tmp_path)
+    cell = the_cell(foreign)
+    config = json.loads((cell.path / "config.json").read_text())
+    config["components"]["plugins"] = {"evil_plugin": {"_target_": "evil_plugin.x"}}
+    write_json(cell.path / "config.json", config)
+    seal(cell)
+    assert import_store(foreign.path, mine).cells == 1
+
+
+def test_files_that_a_cell_does_not_list_are_not_admitted(foreign: Store, mine: Store) -> None:
+    cell = the_cell(foreign)
+    (cell.path / "renders" / "c.png").write_bytes(b"more")
+    (cell.path / "extra.py").write_text("more")
+    names, unlisted = import_store(foreign.path, mine).left_out
+    assert names == f"cells/{cell.id}/extra.py: no store has a file of this name"
+    assert "renders/c.png: it does not belong there" in unlisted
+
+
+def change_manifest(store: Store, **changes: Any) -> None:
+    (name,) = list_names(store.variants)
+    file = store.variants / name / "variant.json"
+    content = json.loads(file.read_text()) | changes
+    hashed = {k: v for k, v in content.items() if k not in ("id", "scene", "code")}
+    content["id"] = f"{content['key']}-{digest(hashed)}"
+    write_json(file, content)
+    file.parent.rename(store.variants / content["id"])
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"factor": 0}, "factor"),
+        ({"views": []}, "views"),
+        ({"files": {"../../x": "0"}}, "files"),
+        ({"more": 1}, "more"),
+    ],
+)
+def test_a_variant_with_a_damaged_manifest_is_left_out(
+    foreign: Store, mine: Store, changes: dict[str, Any], why: str
+) -> None:
+    change_manifest(foreign, **changes)
+    found = import_store(foreign.path, mine)
+    assert found.variants == 0
+    assert why in found.left_out[0]
+    assert list_names(mine.variants) == []
+
+
+@pytest.mark.parametrize("name", ["points.npz", "images/train/a.png"])
+def test_a_variant_with_other_files_is_left_out(foreign: Store, mine: Store, name: str) -> None:
+    (variant,) = list_names(foreign.variants)
+    change(foreign.variants / variant / name)
+    (line,) = import_store(foreign.path, mine).left_out
+    assert line == f"variants/{variant}: {name}: it has changed since it was written"
+
+
+def test_a_folder_of_another_name_is_left_out(foreign: Store, mine: Store) -> None:
+    (variant,) = list_names(foreign.variants)
+    (foreign.variants / variant).rename(foreign.variants / f"{'0' * 16}-{'1' * 16}")
+    (foreign.scenes / SCENE).rename(foreign.scenes / ("0" * 16))
+    found = import_store(foreign.path, mine)
+    assert (found.variants, found.scenes) == (0, 0)
+    assert "another name than its variant" in found.left_out[0]
+    assert "its fingerprint is not the name of its folder" in found.left_out[1]
+
+
+def test_a_record_that_has_changed_or_is_of_no_type_is_left_out(
+    foreign: Store, mine: Store
+) -> None:
+    (sweep_id,) = foreign.sweep_ids()
+    file = foreign.sweeps / f"{sweep_id}.json"
+    file.write_text(file.read_text().replace('"baseline"', '"best"'))
+    (foreign.sweeps / ("0" * 16 + ".json")).write_text('{"version": 1, "command": 3}')
+    found = import_store(foreign.path, mine)
+    assert found.sweeps == 0
+    assert any("command: Expected `array`" in line for line in found.left_out)
+    assert any("its cells have changed" in line for line in found.left_out)
+
+
+# What only archives can have
+
+
+def archive_of(folder: Path, *members: tuple[tarfile.TarInfo | str, bytes]) -> Path:
+    with tarfile.open(folder / "a.tar", "w") as stream:
+        for member, content in members:
+            header = tarfile.TarInfo(member) if isinstance(member, str) else member
+            header.size = len(content)
+            stream.addfile(header, io.BytesIO(content))
+    return folder / "a.tar"
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *(
+            "/etc/passwd",
+            "../x",
+            "cells/../../x",
+            "cells//x",
+            "a\\b",
+            "x\x1b[2J",
+            "cells/" + "x" * 300,
+        ),
+        *("cells/0123456789abcdef/../../x", "cells/0123456789ABCDEF/status.json", "x", "cells/x/y"),
+        *("cells/0123456789abcdef/run.py", "sweeps/../x.json", "variants/x/variant.json"),
+    ],
+)
+def test_a_name_that_no_store_has_is_left_out(mine: Store, tmp_path: Path, name: str) -> None:
+    source = archive_of(tmp_path, (name, b"{}"))
+    before = {path for path in tmp_path.rglob("*") if not path.is_relative_to(mine.path)}
+    found = import_store(source, mine)
+    (line,) = found.left_out
+    assert line.isprintable()
+    assert "a store" in line or "no store" in line
+    assert contents(mine) == {}
+    assert {path for path in tmp_path.rglob("*") if not path.is_relative_to(mine.path)} == before
+
+
+@pytest.mark.parametrize(
+    "kind", [tarfile.SYMTYPE, tarfile.LNKTYPE, tarfile.CHRTYPE, tarfile.FIFOTYPE]
+)
+def test_links_and_devices_are_left_out(mine: Store, tmp_path: Path, kind: bytes) -> None:
+    members = []
+    for name in ("cells/0123456789abcdef/status.json", "cells", "cells/0123456789abcdef/renders"):
+        header = tarfile.TarInfo(name)
+        header.type, header.linkname = kind, "/etc/passwd"
+        members.append((header, b""))
+    found = import_store(archive_of(tmp_path, *members), mine)
+    named = [name for line in found.left_out for name in line.partition(": ")[0].split(", ")]
+    assert len(named) == 3
+    assert all("not a regular file" in line for line in found.left_out)
+    assert contents(mine) == {}
+
+
+@pytest.mark.parametrize(
+    ("first", "second"), [("a", "a"), ("a", "A"), ("\u00e9", "e\u0301"), ("ß", "SS")]
+)
+def test_two_names_that_are_one_on_some_file_systems_are_refused(
+    mine: Store, tmp_path: Path, first: str, second: str
+) -> None:
+    names = [f"cells/0123456789abcdef/renders/{name}.png" for name in (first, second)]
+    found = import_store(archive_of(tmp_path, *((name, b"1") for name in names)), mine)
+    (line,) = found.left_out
+    assert "differs in case alone" in line
+
+
+def test_the_number_of_files_their_bytes_and_lines_are_bounded(
+    mine: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = archive_of(tmp_path, *((f"x{number}", b"1" * 100) for number in range(50)))
+    why = "no store has a file of this name"
+    assert import_store(source, mine).left_out == (f"x0, x1, x2 and 47 more: {why}",)
+    for bound, value in (("_MAX_FILES", 20), ("_MAX_IMPORT_BYTES", 2000)):
+        with monkeypatch.context() as patch:
+            patch.setattr(archive, bound, value)
+            lines = import_store(source, mine).left_out
+        assert lines[0] == f"x0, x1, x2 and 17 more: {why}"
+        assert len(lines) == 2
+        assert "the rest was not read" in lines[-1]
+    monkeypatch.setattr(archive, "_MAX_LINES", 1)
+    monkeypatch.setattr(archive, "_MAX_FILES", 20)
+    assert import_store(source, mine).left_out[1:] == ("and 1 more reasons",)
+
+
+def test_a_header_that_would_fill_the_memory_is_not_read(mine: Store, tmp_path: Path) -> None:
+    header = tarfile.TarInfo("x")
+    header.type, header.size = tarfile.GNUTYPE_LONGNAME, 1 << 36
+    (tmp_path / "a.tar").write_bytes(header.tobuf(tarfile.GNU_FORMAT) + bytes(10_000))
+    with pytest.raises(StoreError, match=r"a\.tar: not an archive of a store"):
+        import_store(tmp_path / "a.tar", mine)
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\3\4", b"x" * 2000, b"\x1f\x8b\x08", b"BZh9xxxx"])
+def test_what_is_no_archive_is_named(mine: Store, tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "a.tar").write_bytes(content)
+    with pytest.raises(StoreError, match=r"a\.tar: not an archive of a store"):
+        import_store(tmp_path / "a.tar", mine)
+
+
+def test_a_source_that_is_not_there_is_named(mine: Store, tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match=r"nothing: No such file"):
+        import_store(tmp_path / "nothing", mine)
+
+
+@pytest.mark.parametrize("kind", ["", ":gz", ":xz"])
+def test_an_archive_that_breaks_off_gives_what_is_whole(
+    foreign: Store, mine: Store, tmp_path: Path, kind: str
+) -> None:
+    """The random bytes at its end do not fit into what was compressed before."""
+    (foreign.path / "zzz").write_bytes(os.urandom(1 << 20))
+    source = tmp_path / "a.tar"
+    mode: Any = f"w{kind}"
+    with tarfile.open(source, mode) as stream:
+        for name in ("cells", "scenes", "sweeps", "variants", "zzz"):
+            stream.add(foreign.path / name, name)
+    os.truncate(source, source.stat().st_size - 100_000)
+    found = import_store(source, mine)
+    assert (found.cells, found.variants, found.scenes, found.sweeps) == (1, 1, 1, 1)
+    assert any("the rest can't be read" in line for line in found.left_out)
+
+
+def test_times_are_kept_and_none_is_in_the_future(
+    foreign: Store, mine: Store, tmp_path: Path
+) -> None:
+    (sweep_id,) = foreign.sweep_ids()
+    file = foreign.sweeps / f"{sweep_id}.json"
+    for modified, expected in ((1e9, 1e9), (1e12, time.time())):
+        os.utime(file, (modified, modified))
+        import_store(foreign.path, Store(tmp_path / str(modified)))
+        kept = (tmp_path / str(modified) / "sweeps" / file.name).stat().st_mtime
+        assert kept == pytest.approx(expected, abs=60)
+
+
+# Interruptions
+
+
+@pytest.mark.parametrize("name", ["_copy", "admit", "_name"])
+def test_a_stopped_import_shows_nothing_that_is_not_whole_and_goes_on(
+    foreign: Store, mine: Store, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A kill leaves the hidden folders, and the lease of a process that is no more."""
+    real, calls = getattr(archive._Border, name), []
+
+    def killed(*arguments: Any) -> Any:
+        calls.append(arguments)
+        if len(calls) == 2 or name == "admit":
+            raise KeyboardInterrupt
+        return real(*arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(archive._Border, name, killed)
+        patch.setattr(archive._Border, "clear", lambda _: None)
+        with pytest.raises(KeyboardInterrupt):
+            import_store(foreign.path, mine)
+    assert [cell.state().name for cell in mine.cell_folders()] in ([], ["done"])
+    before = len([*mine.cell_folders(), *mine.sweep_ids()])
+    shown = [*list_names(mine.variants), *list_names(mine.scenes)]
+    before += len([name for name in shown if not name.startswith(".")])
+    assert before == (1 if name == "_name" else 0)
+    assert import_store(foreign.path, mine).present == before
+    expected = contents(foreign)
+    assert contents(mine) == {k: v for k, v in expected.items() if not k.endswith("log.txt")}
+
+
+def test_a_cell_that_a_sweep_begins_meanwhile_is_the_sweeps(
+    foreign: Store, mine: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cell = mine.cell(the_cell(foreign).id)
+
+    def begun(border: archive._Border) -> Imported:
+        cell.path.mkdir()
+        (cell.path / "log.txt").touch()
+        return real(border)
+
+    real = archive._Border.admit
+    monkeypatch.setattr(archive._Border, "admit", begun)
+    assert import_store(foreign.path, mine) == Imported(0, 1, 1, 1, 1, ())
+    assert list_names(cell.path) == ["log.txt"]
+
+
+def test_the_command_says_what_was_imported_and_what_was_left_out(
+    foreign: Store, call_command: Callable[..., tuple[int, str, str]]
+) -> None:
+    code, said, _ = call_command("store", "import", str(foreign.path), "--store", "mine")
+    assert (code, said.count("imported: 1 cell, 1 variant, ")) == (0, 1)
+    (the_cell(foreign).path / "extra.py").touch()
+    code, said, _ = call_command("store", "import", str(foreign.path), "--store", "mine")
+    assert (code, said.count("already there: 4")) == (1, 1)

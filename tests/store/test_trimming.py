@@ -1,0 +1,205 @@
+"""Tests of cells and variants whose heavy files were removed on purpose."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tests.store.cells import finished, write_variant
+from xrgs.config import Conf
+from xrgs.errors import StoreError, UnreadableError
+from xrgs.safeio.files import list_names
+from xrgs.safeio.hashing import file_digest
+from xrgs.store import restore, trimming
+from xrgs.store.attempts import remove_cell
+from xrgs.store.cell_folder import CellFolder
+from xrgs.store.store import Store
+
+HEAVY = ("renders/a.png", "renders/b.png", "splats.ply")
+BYTES = 20
+
+
+@pytest.fixture
+def cell(tmp_path: Path) -> CellFolder:
+    """A done cell with three heavy files."""
+    return finished(CellFolder(tmp_path / "cells" / "c"))
+
+
+def test_a_trimmed_cell_is_done_and_says_what_it_lacks(cell: CellFolder) -> None:
+    hashes = {name: file_digest(cell.path / name) for name in HEAVY}
+    assert cell.heavy_bytes() == BYTES
+    cell.trim()
+    assert cell.state().name == "done"
+    assert cell.verify() == []
+    assert cell.heavy_bytes() == 0
+    trimmed = cell.status().trimmed
+    assert {name: of.sha256 for name, of in trimmed.items()} == hashes
+    assert not (cell.path / "renders").exists()
+    with pytest.raises(StoreError, match=r"cells/c/splats\.ply was removed by xrgs-store trim"):
+        cell.gaussians()
+    cell.check_not_trimmed("scores.csv")
+    cell.trim()
+    assert cell.status().trimmed == trimmed
+
+
+def test_a_trim_that_was_killed_midway_is_done_and_is_completed(
+    cell: CellFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def killed(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", killed)
+        with pytest.raises(KeyboardInterrupt):
+            cell.trim()
+    assert (cell.path / "splats.ply").exists()
+    assert cell.state().name == "done"
+    assert cell.verify() == []
+    assert cell.heavy_bytes() == BYTES
+    cell.trim()
+    assert cell.heavy_bytes() == 0
+
+
+def test_a_status_that_names_files_elsewhere_is_refused(cell: CellFolder) -> None:
+    (cell.path.parent / "other").write_text("kept")
+    status = json.loads(cell.status_file.read_text())
+    status["trimmed"] = {"../other": {"bytes": 4, "sha256": "0"}}
+    cell.status_file.write_text(json.dumps(status))
+    with pytest.raises(StoreError, match=r"status\.json: key in trimmed: not a name"):
+        cell.trim()
+    assert (cell.path.parent / "other").read_text() == "kept"
+
+
+def test_a_cell_that_is_not_done_is_not_trimmed(cell: CellFolder) -> None:
+    cell.fail("out of luck")
+    with pytest.raises(StoreError, match="the cell is not done"):
+        cell.trim()
+    assert (cell.path / "splats.ply").exists()
+
+
+def test_a_removed_cell_is_gone_with_all_of_its_files(cell: CellFolder) -> None:
+    remove_cell(cell)
+    assert list(cell.path.parent.iterdir()) == []
+    assert cell.state().name == "absent"
+
+
+@pytest.fixture
+def variants(tmp_path: Path) -> Path:
+    """The folder of the variants of a store, with one."""
+    store = Store(tmp_path)
+    store.prepare()
+    write_variant(store.variants, "key")
+    return store.variants
+
+
+def test_a_trimmed_variant_keeps_its_list_and_is_found_by_its_key(variants: Path) -> None:
+    (name,) = list_names(variants)
+    assert trimming.trimmed_variant(variants, "key") is None
+    assert trimming.image_bytes(variants, name) == 10
+    trimming.check_images(variants, name)
+    trimming.trim_variant(variants, name)
+    trimming.trim_variant(variants, name)
+    assert list_names(variants) == [f"trimmed-{name}"]
+    folder = variants / f"trimmed-{name}"
+    assert list_names(folder) == ["points.npz", "report.json", "variant.json"]
+    assert trimming.verify_variant(folder) == []
+    assert trimming.trimmed_variant(variants, "key") == name
+    assert trimming.image_bytes(variants, name) == 0
+    with pytest.raises(StoreError, match=f"variant {name}: its images were removed"):
+        trimming.check_images(variants, name)
+    (folder / "points.npz").write_bytes(b"others")
+    assert "points.npz: it has changed" in trimming.verify_variant(folder)[0]
+
+
+def test_a_cell_of_a_trimmed_variant_has_no_dataset_and_says_why(
+    cell: CellFolder, tmp_path: Path
+) -> None:
+    (tmp_path / "variants" / "trimmed-key-hash").mkdir(parents=True)
+    with pytest.raises(StoreError, match="variant key-hash: its images were removed"):
+        cell.dataset()
+
+
+# images that are made again
+
+
+@pytest.fixture
+def trimmed(variants: Path) -> str:
+    """The id of a variant that was trimmed."""
+    (name,) = list_names(variants)
+    trimming.trim_variant(variants, name)
+    return name
+
+
+@pytest.fixture
+def again(
+    variants: Path, compose: Callable[..., Conf], monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., None]:
+    """(id, error=None) -> restores a variant, whose images are written here; or fails after one."""
+
+    def run(variant_id: str, error: BaseException | None = None) -> None:
+        def images(folder: Path, *_: object) -> None:
+            (folder / "images").mkdir()
+            (folder / "images" / "a.png").write_bytes(b"image")
+            if error:
+                raise error
+
+        monkeypatch.setattr(restore, "restore_images", images)
+        conf = compose("scene=motorcycle")
+        trimming.restore_variant(variants, variant_id, conf.scene, conf.variant, variants)
+
+    return run
+
+
+def names(folder: Path) -> list[str]:
+    return [name for name in list_names(folder) if not name.endswith(".lock")]
+
+
+def test_a_restored_variant_has_its_name_and_its_images(
+    variants: Path, trimmed: str, again: Callable[..., None]
+) -> None:
+    again(trimmed)
+    assert names(variants) == [trimmed]
+    assert (variants / trimmed / "images" / "a.png").read_bytes() == b"image"
+    trimming.check_images(variants, trimmed)
+
+
+def test_a_variant_that_has_its_images_is_left_alone(
+    variants: Path, trimmed: str, again: Callable[..., None]
+) -> None:
+    again(trimmed)
+    again(trimmed, AssertionError("nothing is made"))
+    assert names(variants) == [trimmed]
+
+
+def test_images_that_cant_be_made_again_leave_the_variant_trimmed(
+    variants: Path, trimmed: str, again: Callable[..., None]
+) -> None:
+    with pytest.raises(StoreError, match=rf"variant {trimmed}: .* made again: another image\. Rem"):
+        again(trimmed, StoreError("another image"))
+    assert names(variants) == [f"trimmed-{trimmed}"]
+    assert list_names(variants / f"trimmed-{trimmed}") == [
+        "points.npz",
+        "report.json",
+        "variant.json",
+    ]
+    with pytest.raises(UnreadableError, match="a server is away"):
+        again(trimmed, UnreadableError("a server is away"))
+    assert list_names(variants / f"trimmed-{trimmed}") == [
+        "points.npz",
+        "report.json",
+        "variant.json",
+    ]
+
+
+def test_a_restoration_that_was_killed_midway_is_begun_again(
+    variants: Path, trimmed: str, again: Callable[..., None]
+) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        again(trimmed, KeyboardInterrupt())
+    (variants / f".{trimmed}.restoring").mkdir()
+    assert trimming.trimmed_variant(variants, "key") == trimmed
+    again(trimmed)
+    assert names(variants) == [trimmed]

@@ -1,0 +1,483 @@
+"""Tests that a variant is found or built, and that a scene that fails is remembered."""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.mixture.manifests import one_view
+from xrgs.config import Conf
+from xrgs.errors import StoreError, XrgsError
+from xrgs.mixture import variant
+from xrgs.mixture.paths import TO_TRY
+from xrgs.safeio.atomic import write_json
+from xrgs.store import inspect
+from xrgs.store.store import Store, StoreGoneError
+from xrgs.sweep import build_variants
+from xrgs.sweep.build_variants import PlannedVariant
+from xrgs.sweep.jobs import worker
+from xrgs.sweep.status import describe, read
+
+BUILDING = "building the mixed-resolution variant"
+CONF = ("variant.factor=1", "variant.sfm.fallbacks=false")
+HINT = "failed cells are not trained again; retry=failed trains them again"
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    """An empty store."""
+    store = Store(tmp_path / "s")
+    store.prepare()
+    return store
+
+
+@pytest.fixture
+def conf(compose: Callable[..., Conf]) -> Conf:
+    """A config of the embedded two-image scene."""
+    return compose("scene=motorcycle")
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
+
+
+def plan(conf: Conf, store: Store, *, allow_build: bool) -> PlannedVariant:
+    (planned,) = build_variants.plan([conf], store, allow_build=allow_build)
+    return planned
+
+
+def fail(*_: object) -> dict[str, Any]:
+    raise worker.WorkerError("SfM placed too few views")
+
+
+def unexpected(*_: object) -> dict[str, Any]:
+    raise AssertionError("no child process is needed")
+
+
+def remember_failure(conf: Conf, store: Store) -> None:
+    """Write the report of a build that failed, as `variant.build` does."""
+    folder = store.variants / f"failed-{variant.key(conf.scene, conf.variant)}"
+    folder.mkdir()
+    write_json(folder / "report.json", {"scene": "motorcycle", "reason": "no first pair"})
+
+
+@pytest.fixture
+def reported(store: Store, monkeypatch: pytest.MonkeyPatch) -> PlannedVariant:
+    """The variant `k-1`, of which the store has the report alone."""
+    monkeypatch.setattr(inspect, "read_manifest", lambda _: one_view())
+    report = {"notes": ["icon.png left out"], "hr": ["a"], "tests": 1, "not_registered": ["b"]}
+    (store.variants / "k-1").mkdir()
+    write_json(store.variants / "k-1" / "report.json", report)
+    notes = ("icon.png left out", "not placed, and so not scored: b")
+    return PlannedVariant("k-1", notes=notes)
+
+
+def test_a_frozen_variant_is_found_and_not_built(
+    conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch, reported: PlannedVariant
+) -> None:
+    monkeypatch.setattr(variant, "find", lambda *_: SimpleNamespace(id="k-1"))
+    monkeypatch.setattr(worker, "run_in_child", unexpected)
+    assert build_variants.find_or_build(conf, store) == "k-1"
+    assert plan(conf, store, allow_build=True) == reported
+
+
+def test_a_trimmed_variant_has_its_notes(
+    conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch, reported: PlannedVariant
+) -> None:
+    monkeypatch.setattr(variant, "key", lambda *_: "k")
+    (store.variants / "k-1").rename(store.variants / "trimmed-k-1")
+    assert plan(conf, store, allow_build=False) == reported
+
+
+def test_a_report_that_is_damaged_is_named(
+    conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch, reported: PlannedVariant
+) -> None:
+    monkeypatch.setattr(variant, "find", lambda *_: SimpleNamespace(id="k-1"))
+    (store.variants / "k-1" / "report.json").write_text('{"notes": 3}')
+    (note,) = plan(conf, store, allow_build=True).notes
+    assert "k-1/report.json" in note
+
+
+def test_a_variant_that_the_store_lacks_is_built_in_a_child(
+    conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch, reported: PlannedVariant
+) -> None:
+    requests = []
+
+    def build(job: str, request: dict[str, Any], *_: object) -> dict[str, Any]:
+        requests.append((job, request["conf"]["scene"]["kind"], request["store"]))
+        return {"variant": "k-1"}
+
+    monkeypatch.setattr(worker, "run_in_child", build)
+    assert plan(conf, store, allow_build=False) == PlannedVariant()
+    assert not requests
+    assert plan(conf, store, allow_build=True) == reported
+    assert build_variants.find_or_build(conf, store) == "k-1"
+    assert requests == [("variant", "motorcycle", str(store.path))] * 2
+
+
+def test_a_scene_that_failed_is_not_tried_again_unless_asked(
+    conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    remember_failure(conf, store)
+    monkeypatch.setattr(worker, "run_in_child", unexpected)
+    failed_before = PlannedVariant(error="no first pair", remembered=True)
+    assert plan(conf, store, allow_build=True) == failed_before
+    conf.retry = "failed"
+    assert plan(conf, store, allow_build=False) == PlannedVariant()
+    monkeypatch.setattr(worker, "run_in_child", fail)
+    # The reason is the remembered one, so that the record of a repeated sweep is the same.
+    assert plan(conf, store, allow_build=True) == failed_before
+
+
+def test_a_failure_is_the_reason_in_the_plan_and_an_error_elsewhere(
+    conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(worker, "run_in_child", fail)
+    assert plan(conf, store, allow_build=True) == PlannedVariant(error="SfM placed too few views")
+    with pytest.raises(XrgsError, match="SfM placed too few views"):
+        build_variants.find_or_build(conf, store)
+
+
+def test_a_library_that_dies_of_a_full_disk_is_not_a_failure_of_the_scene(
+    conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(**_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def dies(*_: object) -> dict[str, Any]:
+        monkeypatch.setattr(tempfile, "TemporaryFile", full)
+        raise worker.WorkerError("its process was ended by SIGABRT")
+
+    monkeypatch.setattr(worker, "run_in_child", dies)
+    with pytest.raises(StoreError, match="No space left"):
+        plan(conf, store, allow_build=True)
+
+
+def test_a_child_that_can_not_write_stops_the_sweep(
+    conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def unwritable(*_: object) -> dict[str, Any]:
+        raise worker.UnwritableError("No space left on device")
+
+    monkeypatch.setattr(worker, "run_in_child", unwritable)
+    with pytest.raises(StoreError, match=r"No space left.*Finished cells are kept"):
+        plan(conf, store, allow_build=True)
+
+
+@pytest.mark.parametrize("number", [errno.EACCES, errno.EIO, errno.ESTALE])
+def test_a_variant_that_can_not_be_read_now_is_not_built_anew(
+    conf: Conf,
+    store: Store,
+    monkeypatch: pytest.MonkeyPatch,
+    sick: Callable[[str, int], None],
+    number: int,
+) -> None:
+    frozen = store.variants / f"{variant.key(conf.scene, conf.variant)}-0123456789abcdef"
+    frozen.mkdir()
+    (frozen / "variant.json").write_text("{}")
+    monkeypatch.setattr(worker, "run_in_child", unexpected)
+    sick("variant.json", number)
+    found = plan(conf, store, allow_build=True)
+    assert found == PlannedVariant(unknown=found.unknown)
+    assert f"{frozen}/variant.json: {os.strerror(number)}" in str(found.unknown)
+    assert [path.name for path in frozen.iterdir()] == ["variant.json"]
+
+
+def test_a_folder_of_variants_that_can_not_be_listed_is_unknown(
+    conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(path: Path) -> list[str]:
+        raise OSError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+
+    monkeypatch.setattr(Path, "iterdir", fail)
+    monkeypatch.setattr(worker, "run_in_child", unexpected)
+    assert "Permission denied" in str(plan(conf, store, allow_build=True).unknown)
+
+
+def test_a_child_that_can_not_read_a_file_now_fails_no_scene(
+    conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stale(*_: object) -> dict[str, Any]:
+        raise worker.PassingError("Stale file handle")
+
+    monkeypatch.setattr(worker, "run_in_child", stale)
+    found = plan(conf, store, allow_build=True)
+    assert "Stale file handle" in str(found.unknown)
+    assert found.error is None
+
+
+@pytest.mark.parametrize("seen", ["by its parent", "by the child"])
+def test_a_store_that_vanishes_while_a_variant_is_built_does_not_reappear(
+    conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch, seen: str
+) -> None:
+    def build(
+        _: str, __: object, ___: object, on_poll: Callable[[int], None], ____: object
+    ) -> dict[str, Any]:
+        on_poll(0)
+        store.path.rename(store.path.with_name("moved"))
+        if seen == "by its parent":
+            on_poll(0)
+        raise worker.WorkerError("FileNotFoundError: no such file")
+
+    monkeypatch.setattr(worker, "run_in_child", build)
+    with pytest.raises(StoreGoneError, match="no longer there"):
+        plan(conf, store, allow_build=True)
+    assert not store.path.exists()
+
+
+def two(compose: Callable[..., Conf]) -> list[Conf]:
+    """Configs of two variants of a scene."""
+    return [compose("scene=motorcycle", f"variant.factor={factor}") for factor in (2, 3)]
+
+
+def test_variants_are_built_at_once_on_shares_of_the_cores(
+    compose: Callable[..., Conf],
+    store: Store,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    both = threading.Barrier(2, timeout=30)
+    environments = []
+
+    def build(_: str, request: dict[str, Any], *rest: Any) -> dict[str, Any]:
+        environments.append(rest[-1])
+        both.wait()  # a second build that began after the end of the first would break it
+        return {"variant": f"k-{request['conf']['variant']['factor']}"}
+
+    monkeypatch.setattr(build_variants, "usable_cores", lambda: 5)
+    monkeypatch.setattr(worker, "run_in_child", build)
+    planned = build_variants.plan(two(compose), store, allow_build=True)
+    assert [found.id for found in planned] == ["k-2", "k-3"]
+    assert environments == [{"PYTHON_CPU_COUNT": "2", "TQDM_DISABLE": "1"}] * 2
+    lines = sorted(capfd.readouterr().err.splitlines())
+    assert lines == [f"motorcycle: {BUILDING} {place} of 2" for place in (1, 2)]
+
+
+@pytest.mark.parametrize("lacking", ["cores", "memory"])
+def test_as_many_are_built_at_once_as_there_is_room_for(
+    compose: Callable[..., Conf], store: Store, monkeypatch: pytest.MonkeyPatch, lacking: str
+) -> None:
+    building = threading.Lock()
+
+    def build(*arguments: Any) -> dict[str, Any]:
+        assert "TQDM_DISABLE" not in arguments[-1]
+        assert building.acquire(blocking=False)
+        time.sleep(0.05)
+        building.release()
+        return {"variant": "k-1"}
+
+    monkeypatch.setattr(build_variants, "usable_cores", lambda: 1 if lacking == "cores" else 8)
+    monkeypatch.setattr(
+        build_variants, "usable_memory", lambda: 1 if lacking == "memory" else 1 << 40
+    )
+    monkeypatch.setattr(worker, "run_in_child", build)
+    planned = build_variants.plan(two(compose), store, allow_build=True)
+    assert [found.id for found in planned] == ["k-1", "k-1"]
+
+
+def test_a_build_that_stops_the_sweep_ends_the_others(
+    compose: Callable[..., Conf], store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    both, ended = threading.Barrier(2, timeout=30), []
+
+    def build(
+        _: str, request: dict[str, Any], __: object, on_poll: Callable[[int], None], ___: object
+    ) -> dict[str, Any]:
+        both.wait()
+        if request["conf"]["variant"]["factor"] == 2:
+            raise worker.UnwritableError("No space left on device")
+        end = time.monotonic() + 30
+        try:
+            while time.monotonic() < end:
+                on_poll(0)
+        except worker.InterruptedWorkError:
+            ended.append(3)
+            raise
+        return {"variant": "k-3"}
+
+    monkeypatch.setattr(build_variants, "usable_cores", lambda: 2)
+    monkeypatch.setattr(worker, "run_in_child", build)
+    with pytest.raises(StoreError, match="No space left"):
+        build_variants.plan(two(compose), store, allow_build=True)
+    assert ended == [3]
+
+
+@pytest.mark.slow
+def test_sweeps_of_a_scene_that_sfm_can_not_place(
+    forked_command: Callable[..., tuple[int, str, str]], tmp_path: Path
+) -> None:
+    for number in range(3):  # SIFT finds no feature in a flat image
+        pixels = np.full((30, 40, 3), 40 + number, np.uint8)
+        (tmp_path / "leaves").mkdir(exist_ok=True)
+        Image.fromarray(pixels).save(tmp_path / "leaves" / f"{number}.png")
+    scene = ("scene=folder", "scene.path=leaves", "preset=smoke", "store=s", *CONF)
+    code, table, err = forked_command("sweep", tmp_path, *scene)
+    assert code == 1
+    assert BUILDING in err
+    assert "0 of 3 photographs are placed" in table
+    code, second_table, err = forked_command("sweep", tmp_path, *scene)
+    assert code == 1
+    assert second_table == table
+    assert BUILDING not in err
+    assert "  failed     variant not built" in err
+    assert "0 of 3 photographs are placed" in err
+    assert HINT in err
+    assert err.count(TO_TRY[0]) == table.count(TO_TRY[0]) == 1
+    text = describe(read(tmp_path / "s"))
+    assert "failed scenes, not tried again; retry=failed tries them again" in text
+    assert "  leaves  scene leaves failed: 0 of 3 photographs are placed" in text
+    assert "\n".join(TO_TRY) in text
+    retry = ("retry=failed", "fail_fast=true")
+    code, table, err = forked_command("sweep", tmp_path, *scene, *retry)
+    assert code == 1
+    assert BUILDING in err
+    assert HINT not in err
+
+
+def test_a_folder_that_is_missing_is_looked_for_again_without_retry(
+    sweeps_in: Callable[..., Any], tmp_path: Path
+) -> None:
+    code, _, err = sweeps_in(tmp_path).run("scene=folder", "scene.path=nowhere", "dry_run=true")
+    assert code == 1
+    assert "no such folder" in err
+    assert HINT not in err
+
+
+@pytest.mark.parametrize("readable", [1, 4])
+def test_a_dry_run_reads_the_headers_of_photographs(
+    compose: Callable[..., Conf],
+    store: Store,
+    tmp_path: Path,
+    readable: int,
+) -> None:
+    scene = photographs(tmp_path / "scene", readable)
+    (scene / "x.jpg").write_bytes(b"xx")
+    conf = compose("scene=folder", f"scene.path={scene}")
+    planned = plan(conf, store, allow_build=False)
+    if readable == 4:
+        note, becomes = planned.notes
+        assert note.startswith("left out: x.jpg (unreadable or truncated image")
+        assert becomes == (
+            "4 photographs: 1 held out, 3 to train on, 1 of which are made 5 times smaller;"
+            " variant.hr_fraction=1 leaves them as they are"
+        )
+        assert planned == PlannedVariant(notes=planned.notes)
+    else:
+        assert planned.error is not None
+        assert "scene scene: 1 photograph(s) can be used, two are needed: x.jpg" in planned.error
+    assert not list(store.variants.iterdir())
+
+
+def photographs(folder: Path, count: int, size: tuple[int, int] = (120, 80)) -> Path:
+    folder.mkdir()
+    for number in range(count):
+        Image.new("RGB", size, (number, 0, 0)).save(folder / f"{number}.png")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("count", "size", "changes", "error"),
+    [
+        (
+            2,
+            (120, 80),
+            (),
+            "scene scene: 2 photographs are too few: 1 is held out to test on, and 1 left to train"
+            " on, which takes two. Add photographs, or hold none out: variant.test_every=0",
+        ),
+        (5, (40, 30), (), "0 photograph(s) can be used.*lower variant.factor to 2"),
+        (
+            5,
+            (120, 80),
+            ("variant.test=[1,2,3,4]",),
+            "5 photographs are too few: 4 are held out.* or name fewer or others in variant.test",
+        ),
+        (5, (120, 80), ("variant.tags=megapixels",), "every training view is HR"),
+    ],
+)
+def test_a_plan_says_what_no_variant_can_be_made_of(
+    compose: Callable[..., Conf],
+    store: Store,
+    tmp_path: Path,
+    count: int,
+    size: tuple[int, int],
+    changes: tuple[str, ...],
+    error: str,
+) -> None:
+    scene = photographs(tmp_path / "scene", count, size)
+    conf = compose("scene=folder", f"scene.path={scene}", *changes)
+    planned = plan(conf, store, allow_build=False)
+    assert re.search(re.sub(r"[()]", r"\\\g<0>", error), planned.error or "")
+    with pytest.raises(XrgsError):  # the build says the same, or asks more of SfM
+        variant.build(conf.scene, conf.variant, store.variants, store.scenes)
+
+
+def test_photographs_of_which_too_few_are_trained_on_are_refused_before_sfm(
+    compose: Callable[..., Conf], store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    conf = compose("scene=folder", f"scene.path={photographs(tmp_path / 'scene', 2)}")
+    monkeypatch.setattr(worker, "run_in_child", unexpected)
+    planned = plan(conf, store, allow_build=True)
+    assert "1 is held out to test on" in str(planned.error)
+    assert "HR" not in str(planned.error)
+    assert not planned.remembered
+    monkeypatch.setattr(worker, "run_in_child", fail)  # with every photograph, SfM is tried
+    conf.variant.test_every = 0
+    assert plan(conf, store, allow_build=True).error == "SfM placed too few views"
+
+
+def test_a_plan_says_that_no_view_is_lr(
+    compose: Callable[..., Conf], store: Store, tmp_path: Path
+) -> None:
+    conf = compose("scene=folder", f"scene.path={photographs(tmp_path / 'scene', 3)}")
+    becomes = "3 photographs: 1 held out, 2 to train on, as they are"
+    assert plan(conf, store, allow_build=False).notes == (
+        becomes,
+        "no LR view: 2 training photographs are all HR by variant.min_hr=2; nothing is mixed",
+    )
+    conf.variant.hr_fraction = 1.0  # asked for
+    assert plan(conf, store, allow_build=False).notes == (becomes,)
+
+
+def test_a_variant_that_is_found_says_what_the_folder_has_got_since(
+    compose: Callable[..., Conf],
+    store: Store,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    reported: PlannedVariant,
+) -> None:
+    scene = photographs(tmp_path / "scene", 4)
+    photographs(scene / "store", 1)
+    for name in ("cells", "variants"):  # as the store of a sweep in this folder
+        (scene / "store" / name).mkdir()
+    monkeypatch.setattr(variant, "find", lambda *_: SimpleNamespace(id="k-1"))
+    conf = compose("scene=folder", f"scene.path={scene}/**")
+    notes = plan(conf, store, allow_build=True).notes
+    assert notes == ("images left out: 1 in store (a store of xrgs)", *reported.notes)
+
+
+def test_images_are_made_again_of_trimmed_variants_alone(
+    conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch, reported: PlannedVariant
+) -> None:
+    requests = []
+    monkeypatch.setattr(worker, "run_in_child", lambda *given: requests.append(given[:2]))
+    build_variants.restore(conf, store, "k-1")
+    assert requests == []
+    (store.variants / "trimmed-k-1").mkdir()
+    build_variants.restore(conf, store, "k-1")
+    ((job, request),) = requests
+    assert job == "restore"
+    assert (request["variant"], request["store"]) == ("k-1", str(store.path))
+    assert request["conf"]["scene"]["kind"] == "motorcycle"

@@ -1,0 +1,353 @@
+"""Gaussians in .glb files: glTF 2.0 with the extension KHR_gaussian_splatting.
+
+Scales and opacities are stored after their activation functions, quaternions as unit xyzw, and the
+harmonics by coefficient, all as float32. glTF's y axis points up; that of .ply files points down.
+Gaussians are turned so, and their node not: programs differ in whether a node turns harmonics.
+
+The extension names no antialiased Gaussians and sorts by the distance from the camera, where 3D
+Gaussian Splatting sorts by depth. An own file says in `extras` that its Gaussians are antialiased,
+and how they were turned.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from xrgs.errors import XrgsError
+from xrgs.formats.saved import (
+    CERTAIN_LOGIT,
+    FLAT_LOG_SCALE,
+    SavedGaussians,
+    check_arrays_finite,
+    to_gaussians,
+)
+from xrgs.formats.similarity import transformed
+from xrgs.safeio.atomic import atomic_writer
+from xrgs.splat.gaussians import PARAMETERS
+from xrgs.splat.normalize import rotation_between
+from xrgs.splat.sh import C0, MAX_DEGREE, bases
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from xrgs.splat.gaussians import Gaussians
+
+    Array = NDArray[Any]
+    Json = dict[str, Any]
+
+EXTENSION = "KHR_gaussian_splatting"
+_READ_EXTENSIONS = {EXTENSION, "KHR_mesh_quantization"}  # of those that a file may require
+_MAGIC, _VERSION, _JSON, _BINARY = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
+_MAX_JSON = 1 << 24  # bytes
+_POINTS = 0
+_VERTEX_DATA = 34962  # the target of a bufferView
+_COMPONENTS = {5120: "i1", 5121: "u1", 5122: "i2", 5123: "u2", 5126: "f4"}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+#: Half a turn about z: from y down, as in .ply files, to y up. SplatTransform turns them so.
+_DOWN_TO_UP = np.diag([-1.0, -1.0, 1.0])
+#: The quaternion xyzw by which an own file's Gaussians were turned from their world, in `extras`.
+_TURNED_BY = "turned_by"
+#: Up to version 0.2.0: the node is turned, which is only for display, and the Gaussians are not.
+_DISPLAY = "turned_for_display"
+
+
+def write_glb(
+    path: Path,
+    gaussians: Gaussians,
+    *,
+    antialiased: bool = False,
+    up: Sequence[float] = (0.0, -1.0, 0.0),
+) -> None:
+    """Write Gaussians to a .glb file, which is replaced atomically.
+
+    Args:
+        path: The file to write.
+        gaussians: The Gaussians; at least one.
+        antialiased: Whether they are to be rendered with `RasterSettings.antialiased`.
+        up: The direction [3] in their world that becomes glTF's +y; they are turned so.
+
+    Raises:
+        XrgsError: There are no Gaussians, they have scales that are not finite, or take 4 GB.
+        OSError: The file can't be written.
+    """
+    if len(gaussians) == 0:
+        raise XrgsError(f"{path}: glTF can't hold a model without Gaussians")
+    start = np.asarray(up, np.float64)
+    matrix = np.eye(4)
+    matrix[:3, :3] = _DOWN_TO_UP @ rotation_between(
+        start / np.linalg.norm(start), np.array([0.0, -1, 0])
+    )
+    attributes = _attributes(transformed(gaussians, matrix))
+    check_arrays_finite(path, attributes)
+    content = [np.ascontiguousarray(values).tobytes() for values in attributes.values()]
+    description = _described(attributes, content, matrix[:3, :3], antialiased)
+    text = json.dumps(description, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    size = sum(map(len, content))
+    total = 12 + 8 + len(text) + 8 + size
+    if total >= 1 << 32:
+        raise XrgsError(
+            f"{path}: {len(gaussians)} Gaussians take {total} bytes, a .glb holds 4 GiB"
+        )
+    with atomic_writer(path) as file:
+        file.write(struct.pack("<III", _MAGIC, _VERSION, total))
+        file.write(struct.pack("<II", len(text), _JSON) + text)
+        file.write(struct.pack("<II", size, _BINARY))
+        file.writelines(content)
+
+
+def _attributes(gaussians: Gaussians) -> dict[str, Array]:
+    """Return the arrays of the mesh by the names of their attributes; quaternions are unit ones."""
+    means, quats, scales, opacities, sh0, shN = (
+        gaussians[name].detach().double().numpy() for name in PARAMETERS
+    )
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused by name
+        alpha = 1 / (1 + np.exp(-opacities))
+        linear = {"SCALE": np.exp(scales), "ROTATION": quats[:, [1, 2, 3, 0]], "OPACITY": alpha}
+        attributes = {f"{EXTENSION}:{name}": values for name, values in linear.items()}
+        sh = np.concatenate([sh0, shN], axis=1)  # [N, K, 3]
+        for name, at in _harmonics(sh.shape[1]).items():
+            attributes[name] = sh[:, at]
+        floats = {name: values.astype("<f4") for name, values in attributes.items()}
+        colors = _fallback_colors(sh0[:, 0], alpha)
+    return {"POSITION": means.astype("<f4"), **floats, "COLOR_0": colors}
+
+
+def _harmonics(count: int) -> dict[str, int]:
+    """Return the index of each coefficient by the name of its attribute."""
+    names = [
+        f"{EXTENSION}:SH_DEGREE_{band}_COEF_{of}"
+        for band in range(math.isqrt(count))
+        for of in range(2 * band + 1)
+    ]
+    return {name: at for at, name in enumerate(names)}
+
+
+def _fallback_colors(sh0: Array, alpha: Array) -> Array:
+    """Return the linear colours and opacities [N, 4] uint8 that other viewers draw points with."""
+    rgb = (C0 * sh0 + 0.5).clip(0, 1)
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)  # from sRGB
+    return np.asarray((np.column_stack([linear, alpha]) * 255).round().astype(np.uint8))
+
+
+def _described(
+    attributes: Mapping[str, Array], content: Sequence[bytes], turn: Array, antialiased: bool
+) -> Json:
+    """Return the JSON of a file with one mesh, whose arrays follow each other in one buffer."""
+    accessors: list[Json] = []
+    views: list[Json] = []
+    offset = 0
+    for number, (name, values) in enumerate(attributes.items()):
+        width = 1 if values.ndim == 1 else values.shape[1]
+        is_float = values.dtype.kind == "f"
+        accessor: Json = {
+            "bufferView": number,
+            "componentType": 5126 if is_float else 5121,
+            "count": len(values),
+            "type": {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[width],
+        }
+        if not is_float:
+            accessor["normalized"] = True
+        if name == "POSITION":  # its bounds are required
+            accessor |= {"min": values.min(0).tolist(), "max": values.max(0).tolist()}
+        accessors.append(accessor)
+        length = len(content[number])
+        views.append(
+            {"buffer": 0, "byteOffset": offset, "byteLength": length, "target": _VERTEX_DATA}
+        )
+        offset += length
+    extension: Json = {
+        "kernel": "ellipse",
+        "colorSpace": "srgb_rec709_display",
+        "projection": "perspective",
+        "sortingMethod": "cameraDistance",
+        "extras": {"antialiased": antialiased},
+    }
+    primitive = {
+        "attributes": {name: number for number, name in enumerate(attributes)},
+        "mode": _POINTS,
+        "extensions": {EXTENSION: extension},
+    }
+    quaternion = Rotation.from_matrix(turn).as_quat().tolist()  # xyzw
+    return {
+        "asset": {"version": "2.0", "generator": "xrgs"},
+        "extensionsUsed": [EXTENSION],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "extras": {_TURNED_BY: quaternion}}],
+        "meshes": [{"primitives": [primitive]}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": offset}],
+    }
+
+
+def read_glb(path: Path) -> SavedGaussians:
+    """Read the Gaussians of a .glb file.
+
+    They come back with the axes of .ply files, in which y points down: the transformation of their
+    node is applied, then half a turn about z. The Gaussians of an own file come back in the world
+    that they were written from.
+
+    Raises:
+        XrgsError: The file can't be read, is damaged, or has no or several models of Gaussians, or
+            Gaussians of a kind that is not served; the message names it.
+    """
+    try:
+        with path.open("rb") as file:
+            content = file.read()
+    except OSError as error:
+        raise XrgsError(f"{path}: cannot be read: {error.strerror}") from error
+    try:
+        return _read(path, content)
+    except (KeyError, IndexError, TypeError, AttributeError, RecursionError) as error:
+        # The JSON may hold anything anywhere; what follows names what is missing or is misplaced.
+        raise XrgsError(f"{path}: is a damaged .glb ({type(error).__name__}: {error})") from error
+    except ValueError as error:
+        raise XrgsError(f"{path}: {error}") from error
+
+
+def _read(path: Path, content: bytes) -> SavedGaussians:
+    description, binary = _chunks(content)
+    if needed := set(description.get("extensionsRequired", ())) - _READ_EXTENSIONS:
+        raise ValueError(f"{', '.join(sorted(needed))} is not read")
+    node, primitive = _model(description)
+    extension = primitive["extensions"][EXTENSION]
+    if "extensions" in extension:
+        raise ValueError(f"{', '.join(extension['extensions'])} is not read")
+    if extension["kernel"] != "ellipse" or extension["colorSpace"] != "srgb_rec709_display":
+        raise ValueError(
+            f"Gaussians of kernel {extension['kernel']!r} and colour space "
+            f"{extension['colorSpace']!r} are not served"
+        )
+    arrays = {
+        name: _array(description, binary, number)
+        for name, number in primitive["attributes"].items()
+        if name == "POSITION" or name.startswith(f"{EXTENSION}:")
+    }
+    check_arrays_finite(path, arrays)
+    gaussians = _gaussians(arrays)
+    own = description["nodes"][node].get("extras", {})
+    if not own.get(_DISPLAY):
+        world = _to_world(description["nodes"], node)
+        turn = Rotation.from_quat(own[_TURNED_BY]).as_matrix() if _TURNED_BY in own else _DOWN_TO_UP
+        world[:3] = turn.T @ world[:3]
+        gaussians = transformed(gaussians, world)
+    return SavedGaussians(gaussians, bool(extension.get("extras", {}).get("antialiased")))
+
+
+def _chunks(content: bytes) -> tuple[Json, bytes]:
+    """Return the JSON and the buffer of a .glb."""
+    if len(content) < 20 or struct.unpack_from("<II", content) != (_MAGIC, _VERSION):
+        raise ValueError("is not a .glb file of version 2")
+    length, kind = struct.unpack_from("<II", content, 12)
+    if kind != _JSON or length > min(_MAX_JSON, len(content) - 20):
+        raise ValueError("is cut off, or has no JSON of less than 16 MB at its start")
+    description = json.loads(content[20 : 20 + length])
+    binary = content[20 + length :]
+    if len(binary) < 8:
+        raise ValueError("has no binary chunk")
+    size, kind = struct.unpack_from("<II", binary)
+    if kind != _BINARY or size > len(binary) - 8:
+        raise ValueError("is cut off: its binary chunk is not whole")
+    return description, binary[8 : 8 + size]
+
+
+def _model(description: Json) -> tuple[int, Json]:
+    """Return the node and the primitive of the only model of Gaussians."""
+    found = [
+        (number, primitive)
+        for number, node in enumerate(description.get("nodes", []))
+        if "mesh" in node
+        for primitive in description["meshes"][node["mesh"]]["primitives"]
+        if EXTENSION in primitive.get("extensions", {})
+    ]
+    if len(found) != 1:
+        raise ValueError(f"has {len(found)} models of {EXTENSION}; one is read")
+    return found[0]
+
+
+def _array(description: Json, binary: bytes, number: int) -> NDArray[np.float64]:
+    """Return the values [N, width] of an accessor."""
+    accessor = description["accessors"][number]
+    if "sparse" in accessor:
+        raise ValueError("sparse accessors are not read")
+    view = description["bufferViews"][accessor["bufferView"]]
+    kind = np.dtype(f"<{_COMPONENTS[accessor['componentType']]}")
+    width, count = _WIDTHS[accessor["type"]], accessor["count"]
+    stride = view.get("byteStride", width * kind.itemsize)
+    start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+    end = start + stride * (count - 1) + width * kind.itemsize
+    if view["buffer"] != 0 or min(start, count - 1, stride - 1) < 0 or end > len(binary):
+        raise ValueError(f"accessor {number} reaches beyond the binary chunk")
+    strides = (stride, kind.itemsize)
+    stored = np.ndarray((count, width), kind, binary, offset=start, strides=strides)
+    with np.errstate(invalid="ignore"):  # numpy warns of NaN of some bits
+        values = stored.astype(np.float64)
+    if accessor.get("normalized"):
+        values = np.maximum(values / np.iinfo(kind).max, -1.0)
+    return values
+
+
+def _gaussians(arrays: Mapping[str, NDArray[np.float64]]) -> Gaussians:
+    bands = [_harmonics(bases(degree)) for degree in range(MAX_DEGREE + 1)]
+    names = max((of for of in bands if of.keys() <= arrays.keys()), key=len, default=bands[0])
+    widths = {"POSITION": 3, **dict.fromkeys(names, 3)}
+    widths |= {
+        f"{EXTENSION}:{name}": width
+        for name, width in (("ROTATION", 4), ("SCALE", 3), ("OPACITY", 1))
+    }
+    # A draft of the extension had other names; a band that is not whole would be left out.
+    if differing := sorted(widths.keys() ^ arrays.keys()):
+        raise ValueError(f"has too few or too many attributes: {', '.join(differing)}")
+    for name, width in widths.items():
+        if arrays[name].shape != (len(arrays["POSITION"]), width):
+            raise ValueError(f"{name} is {list(arrays[name].shape)}, which does not fit")
+    sh = np.stack([arrays[name] for name in names], axis=1)  # [N, K, 3]
+    alpha = arrays[f"{EXTENSION}:OPACITY"][:, 0]
+    scales = arrays[f"{EXTENSION}:SCALE"]
+    if ((alpha < 0) | (alpha > 1)).any() or (scales < 0).any():
+        raise ValueError("has opacities outside 0..1, or scales below 0")
+    with np.errstate(divide="ignore"):
+        logits = np.log(alpha) - np.log1p(-alpha)
+        logs = np.log(scales)
+    values = {
+        "means": arrays["POSITION"],
+        "quats": arrays[f"{EXTENSION}:ROTATION"][:, [3, 0, 1, 2]],
+        "scales": logs.clip(FLAT_LOG_SCALE),
+        "opacities": logits.clip(-CERTAIN_LOGIT, CERTAIN_LOGIT),
+        "sh0": sh[:, :1],
+        "shN": sh[:, 1:],
+    }
+    return to_gaussians(values)
+
+
+def _to_world(nodes: Sequence[Json], node: int) -> NDArray[np.float64]:
+    """Return the global transformation [4, 4] of a node."""
+    parents = {child: at for at, of in enumerate(nodes) for child in of.get("children", [])}
+    matrix, at = np.eye(4), node
+    for _ in nodes:  # a damaged file may have a circle
+        matrix = _local(nodes[at]) @ matrix
+        if at not in parents:
+            break
+        at = parents[at]
+    return matrix
+
+
+def _local(node: Json) -> NDArray[np.float64]:
+    if "matrix" in node:
+        return np.array(node["matrix"], np.float64).reshape(4, 4).T  # by column in the file
+    matrix = np.eye(4)
+    rotation = Rotation.from_quat(node.get("rotation", [0, 0, 0, 1])).as_matrix()
+    matrix[:3, :3] = rotation * np.array(node.get("scale", [1, 1, 1]), np.float64)
+    matrix[:3, 3] = node.get("translation", [0, 0, 0])
+    return matrix

@@ -1,0 +1,82 @@
+"""Moves Gaussians from one world to another: rotation, scale and translation."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from xrgs.formats.saved import unit_quaternions
+from xrgs.splat.gaussians import Gaussians
+from xrgs.splat.sh import bases, sh_basis
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+#: How far the axes of a similarity may be from equally long and perpendicular ones, as a share.
+_TOLERANCE = 1e-4
+
+
+def transformed(gaussians: Gaussians, similarity: NDArray[np.float64]) -> Gaussians:
+    """Return Gaussians in another world, where cameras that moved as well see the same.
+
+    Args:
+        gaussians: N Gaussians.
+        similarity: [4, 4] from the old world to the new one: a rotation, which may mirror, times a
+            scale above 0, and a translation.
+
+    Returns:
+        float32 leaf tensors with gradients on, with unit quaternions; computed in float64.
+
+    Raises:
+        ValueError: The matrix is no such similarity.
+    """
+    linear = similarity[:3, :3]
+    determinant = float(np.linalg.det(linear)) if np.isfinite(similarity).all() else 0.0
+    if determinant == 0:
+        raise ValueError("must be finite, a rotation times a scale above 0")
+    scale = np.cbrt(abs(determinant))
+    rotation = linear / scale
+    if not np.allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=_TOLERANCE):
+        raise ValueError("must be a rotation times one scale for all axes, without shear")
+    # A mirror turns an ellipsoid as its negative does, which is a rotation.
+    proper = Rotation.from_matrix(rotation * np.sign(determinant))
+    values = {
+        "means": gaussians.means.detach().double() @ torch.from_numpy(linear.T.copy())
+        + torch.from_numpy(similarity[:3, 3].copy()),
+        "quats": _product(proper, torch.from_numpy(unit_quaternions(gaussians.quats))),
+        "scales": gaussians.scales.detach().double() + float(np.log(scale)),
+        "opacities": gaussians.opacities.detach(),
+        "sh0": gaussians.sh0.detach(),
+        "shN": _turned_harmonics(gaussians.shN.detach().double(), torch.from_numpy(rotation)),
+    }
+    return Gaussians(**{name: of.float().clone().requires_grad_() for name, of in values.items()})
+
+
+def _product(turn: Rotation, quats: Tensor) -> Tensor:
+    """Return the quaternions [N, 4] wxyz of rotations that are followed by a turn."""
+    x, y, z, w = (float(value) for value in turn.as_quat())
+    matrix = [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]
+    return quats @ torch.tensor(matrix, dtype=torch.float64).T
+
+
+def _turned_harmonics(coefficients: Tensor, turn: Tensor) -> Tensor:
+    """Return coefficients [N, K - 1, 3] whose function f' has f'(turn d) = f(d) for all d.
+
+    A turn or a mirror mixes only the harmonics of a band among each other. How is found from their
+    values at more directions than there are harmonics, which determine it exactly.
+    """
+    degree = round((coefficients.shape[1] + 1) ** 0.5) - 1
+    dirs = torch.randn((64, 3), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    dirs /= dirs.norm(dim=1, keepdim=True)
+    before, after = sh_basis(degree, dirs @ turn), sh_basis(degree, dirs)  # [64, K]
+    turned = torch.zeros_like(coefficients)
+    for band in range(1, degree + 1):
+        of = slice(bases(band - 1), bases(band))
+        mixing = torch.linalg.lstsq(after[:, of], before[:, of]).solution  # [2l + 1, 2l + 1]
+        rest = slice(of.start - 1, of.stop - 1)
+        turned[:, rest] = torch.einsum("jk,nkc->njc", mixing, coefficients[:, rest])
+    return turned

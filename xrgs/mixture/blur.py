@@ -1,0 +1,114 @@
+"""Estimates how blurry LR photographs are, from spectra alone.
+
+Training through a known kernel is wrong for photographs that are blurrier than this kernel makes
+them. Photographs of one scene have about the same power at the same frequency in the scene. So what
+LR photographs have less of it than HR photographs tells their blur, without pairs of photographs.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from xrgs.photos import images, masks
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from xrgs.mixture.views import View
+
+Array = NDArray[np.float64]
+
+#: The edges of the rings in which power is compared, cycles per LR px. Lower frequencies depend on
+#: what a view shows; higher ones are aliased, noisy, and lost in JPEG. Our choice.
+_RINGS = np.linspace(0.1, 0.3, 9)
+#: The fewest px of a side, at the sampling rate of LR views: each ring then has a frequency in it.
+_LEAST_SIDE = 32
+#: The most views of a class that are read. Our choice.
+_MOST_VIEWS = 16
+#: The blur, LR px, above which LR photographs are called blurrier than their pixels. A pixel's box
+#: has sqrt(1 / 12) = 0.29, and LR views of degradation=phone 0.85. Our choice, between the two.
+_BLURRY = 0.5
+_LUMA = np.array([0.299, 0.587, 0.114])
+
+
+def lr_blur(views: Sequence[View]) -> float | None:
+    """Estimate the blur of LR training views: the sigma of a Gaussian that would give it, LR px.
+
+    The power P of LR and HR views, in rings of frequencies f in cycles per LR px, is fitted by
+
+        log P_LR(f) - log P_HR(f) = c - (2 pi sigma f)^2
+
+    where log P is the mean over views. HR views are read at the same frequencies in the scene, by
+    the median sampling rates of both classes. A pixel's box has a sigma of 0.29. The blur of HR
+    views is subtracted; it is small where they sample the scene much more finely.
+
+    Args:
+        views: The views of a variant, with their files.
+
+    Returns:
+        sigma, 0 or more; None without views of both classes that are large enough.
+    """
+    hr, lr = (
+        [view for view in views if (view.split, view.tag) == ("train", tag)] for tag in ("HR", "LR")
+    )
+    if not hr or not lr:
+        return None
+    finer = float(
+        np.median([view.sampling_rate for view in hr])
+        / np.median([view.sampling_rate for view in lr])
+    )
+    sharp, blurred = _mean_log_power(hr, finer), _mean_log_power(lr, 1.0)
+    if sharp is None or blurred is None:
+        return None
+    middle = (_RINGS[1:] + _RINGS[:-1]) / 2
+    slope, _ = np.polyfit((2 * np.pi * middle) ** 2, blurred - sharp, 1)
+    return float(np.sqrt(max(0.0, -slope)))
+
+
+def blur_notes(blur: float | None) -> list[str]:
+    """Say where LR photographs are blurrier than their pixels, and what learns the blur."""
+    if blur is None or blur <= _BLURRY:
+        return []
+    return [
+        f"LR photographs are blurrier than their pixels: by a Gaussian of {blur:.2f} px, where a"
+        " pixel's area has 0.29. plus, lean and +ablation=formation learn the blur;"
+        " components.supersampled alone takes them to be sharper"
+    ]
+
+
+def _mean_log_power(views: Sequence[View], finer: float) -> Array | None:
+    """Average the `_log_power` of views; None where all of them are too small."""
+    least = _LEAST_SIDE * finer
+    usable = [view for view in views if min(view.width, view.height) >= least]
+    if not usable:
+        return None
+    every = math.ceil(len(usable) / _MOST_VIEWS)
+    mean: Array = np.mean([_log_power(view, finer) for view in usable[::every]], axis=0)
+    return mean
+
+
+def _log_power(view: View, finer: float) -> Array:
+    """Return the logarithm of the mean power of a view's luma in each ring.
+
+    Args:
+        view: The view.
+        finer: How many times more finely than LR views it samples the scene.
+    """
+    size = view.width, view.height
+    pixels = np.asarray(images.read_png_pil(view.file, size))
+    mask = None if view.mask is None else images.read_mask(view.mask, size)
+    luma = masks.filled(pixels, mask) @ _LUMA
+    # A view ends abruptly at its borders, which a window hides.
+    window = np.outer(np.hanning(view.height), np.hanning(view.width))
+    luma = (luma - np.average(luma, weights=window)) * window
+    power = np.abs(np.fft.fft2(luma)) ** 2
+    rows, columns = np.fft.fftfreq(view.height), np.fft.fftfreq(view.width)
+    ring = np.digitize(finer * np.hypot(rows[:, None], columns), _RINGS).ravel()
+    counts = np.bincount(ring, minlength=len(_RINGS) + 1)[1:-1]
+    sums = np.bincount(ring, power.ravel(), minlength=len(_RINGS) + 1)[1:-1]
+    # One step of 8 bits in a view: the logarithm is finite where a view is of one colour.
+    return np.log(sums / counts + 1.0)

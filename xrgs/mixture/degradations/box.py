@@ -1,0 +1,18 @@
+"""Averages a view over the area of each LR pixel, as a sensor without blur does."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from xrgs.photos import images
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from xrgs.config import VariantConf
+    from xrgs.photos.images import ImageArray
+
+
+def box(high: ImageArray, conf: VariantConf, _rng: np.random.Generator) -> ImageArray:
+    """Return the means [H / factor, W / factor, 3] of blocks of `factor` x `factor` pixels."""
+    return images.block_means(high, conf.factor)

@@ -1,0 +1,20 @@
+"""Takes the detail from a view and keeps its size, as a sensor that upsamples gives it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from xrgs.photos import images
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from xrgs.config import VariantConf
+    from xrgs.photos.images import ImageArray
+
+
+def digital_zoom(high: ImageArray, conf: VariantConf, _rng: np.random.Generator) -> ImageArray:
+    """Return the view [H, W, 3] after it was downsampled by `factor` and resized back."""
+    height, width = high.shape[:2]
+    small = images.resize(high, width // conf.factor, height // conf.factor)
+    return images.resize(small, width, height)

@@ -1,0 +1,19 @@
+"""Downsamples a view: `variant.factor` times fewer pixels per side (paper, section 4.1)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from xrgs.photos import images
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from xrgs.config import VariantConf
+    from xrgs.photos.images import ImageArray
+
+
+def downsample(high: ImageArray, conf: VariantConf, _rng: np.random.Generator) -> ImageArray:
+    """Return the view [H / factor, W / factor, 3]."""
+    height, width = high.shape[:2]
+    return images.resize(high, width // conf.factor, height // conf.factor)

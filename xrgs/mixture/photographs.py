@@ -1,0 +1,516 @@
+"""Turns a scene's photographs into HR views on disk, and decides which of them share a camera."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from xrgs.errors import UnreadableError, XrgsError
+from xrgs.mixture.degradations import DEGRADATIONS, resolve_degradation
+from xrgs.mixture.split import HrGeometry, TooSmallError, hr_geometry, shrink_factor
+from xrgs.photos import exif, images, masks
+from xrgs.photos.lens import Lens, lens_of_model, undistort
+from xrgs.photos.masks import MASKS, Mask, Masks, copy_mask
+from xrgs.runtime.progress import progress
+from xrgs.runtime.text import listed
+from xrgs.safeio.hashing import digest
+
+if TYPE_CHECKING:
+    from xrgs.config import VariantConf
+    from xrgs.photos.scenes import Scene
+
+#: Photographs without EXIF of a size are taken to be by one camera where so many have a size, on
+#: average. Our choice.
+_LEAST_OF_SIZE = 5
+
+_Content = TypeVar("_Content")
+_T = TypeVar("_T", np.float32, np.bool_)
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """A photograph of a scene."""
+
+    name: str
+    """The name that its view gets."""
+    number: str
+    """The name of its copies on disk, because COLMAP need not accept people's file names."""
+    size: tuple[int, int]
+    """Width and height of the file, with the EXIF orientation applied, px."""
+    orientation: int
+    """The EXIF orientation that was applied, 1 to 8; 1 is upright."""
+    hr: HrGeometry
+    """The size of its HR view."""
+    sfm: tuple[int, int]
+    """Width and height at which SfM gets the whole photograph, px."""
+    camera: str
+    """The name of its camera; photographs with one name share the camera in SfM."""
+    K: NDArray[np.float64] | None
+    """Intrinsics [3, 3] of the file, px, where they are known; then there is no distortion."""
+    focal_35mm: float | None
+    """The focal length that EXIF gives, for a film of 36 x 24 mm, mm."""
+    path: Path
+    """The file."""
+
+    @property
+    def lens(self) -> Lens | None:
+        """The camera of the file; None where it is not known."""
+        if self.K is None:
+            return None
+        K = self.K
+        return lens_of_model("PINHOLE", self.size, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
+
+    def to_hr(self, lens: Lens) -> Lens:
+        """Return the camera of the HR view; `lens` is of the whole photograph, at any size."""
+        return lens.resized(*self.hr.resized).cropped(
+            *self.hr.crop_offset, self.hr.width, self.hr.height
+        )
+
+
+@dataclass(frozen=True)
+class PhotoCollection:
+    """The usable photographs of a scene, sorted by name, and their copies in a work folder.
+
+    A copy has one of these kinds:
+
+    - `hr` is the HR view, and `lr` the degraded view.
+    - `sfm` is the whole photograph for SfM, and `sfm_lr` is that copy degraded.
+    - `sfm_up` and `sfm_lr_up` are these two resized to `Photograph.sfm`.
+    - `shown`, of photographs with a mask alone, is the HR view with the pixels that the mask hides.
+
+    A copy may have a mask. In all kinds but `shown`, pixels that the mask of a photograph hides
+    have the colour of the nearest other one.
+    """
+
+    all: tuple[Photograph, ...]
+    folder: Path
+    notes: tuple[str, ...] = ()
+    """Sentences on what was left out, turned, converted and composited."""
+
+    def __len__(self) -> int:
+        return len(self.all)
+
+    def __getitem__(self, index: int) -> Photograph:
+        return self.all[index]
+
+    @property
+    def names(self) -> list[str]:
+        """The names of the photographs, in order."""
+        return [photo.name for photo in self.all]
+
+    def file(self, kind: str, index: int) -> str:
+        """Return the path of a copy in `folder`; the copy need not exist."""
+        return f"{kind}/{self.all[index].number}.png"
+
+    def size(self, kind: str, index: int) -> tuple[int, int]:
+        """Return width and height of an existing copy, px."""
+        return images.size(self.folder / self.file(kind, index))
+
+    def read(self, kind: str, index: int) -> images.ImageArray:
+        """Read an existing copy, [H, W, 3] in 0..1."""
+        return images.read(self.folder / self.file(kind, index))
+
+    def mask(self, kind: str, index: int) -> Mask | None:
+        """Read the mask of an existing copy, [H, W]; None where all of its pixels are used."""
+        file = copy_mask(self.folder, self.file(kind, index))
+        return images.read_mask(file, self.size(kind, index)) if file.exists() else None
+
+    def save_mask(self, kind: str, index: int, mask: Mask | None) -> None:
+        """Write the mask of a copy; None writes nothing."""
+        if mask is not None:
+            images.save_mask(copy_mask(self.folder, self.file(kind, index)), mask, durable=False)
+
+    def upsampled(self, kind: str, index: int) -> str:
+        """Resize a copy to `Photograph.sfm`; return the kind of the copy that has this size."""
+        target, up = self.all[index].sfm, f"{kind}_up"
+        if self.size(kind, index) == target:
+            return kind
+        file = self.folder / self.file(up, index)
+        if not file.exists():
+            images.save(file, images.resize(self.read(kind, index), *target), durable=False)
+            self.save_mask(up, index, masks.resized(self.mask(kind, index), *target))
+        return up
+
+    def undistorted(
+        self, kind: str, index: int, lens: Lens
+    ) -> tuple[images.ImageArray, Mask | None]:
+        """Undistort a copy, and its mask.
+
+        Args:
+            kind: `hr` or `lr`.
+            index: The photograph.
+            lens: The camera of the copy.
+
+        Returns:
+            The image [H, W, 3], not clamped. In an HR view, pixels outside the mask are as in the
+            photograph. The mask [H, W], or None where all pixels are used.
+        """
+        image, mask = undistort(self.read(kind, index), lens), self.mask(kind, index)
+        if mask is None:
+            return image, None
+        used = masks.undistorted(mask, lens)
+        if kind == "hr":
+            image = np.where(used[..., None], image, undistort(self.read("shown", index), lens))
+        return image, used
+
+
+def prepare_hr_views(
+    scene: Scene, conf: VariantConf, work: Path, *, for_sfm: bool = False
+) -> PhotoCollection:
+    """Decode every photograph once, and write each that can be used as an HR view.
+
+    All are resized by one factor, so that a camera that resolved more than another still does.
+    Photographs that can't be used are left out, and named in the notes.
+
+    Args:
+        scene: The scene.
+        conf: The variant's config.
+        work: An existing folder for the copies.
+        for_sfm: Whether the `sfm` copies are written, too.
+
+    Raises:
+        UnreadableError: A photograph can't be read now. It is not left out: the variant would be
+            another one whenever a disk or a server fails.
+        XrgsError: Fewer than two photographs can be used, or one is too large for a variant; the
+            message names the photographs. A mask can't be read, or is of another picture.
+    """
+    (work / MASKS).mkdir(exist_ok=True)
+    headers, left_out = _read_headers(scene.files)
+    given = Masks.fitted(scene.masks, headers)
+    numbers = {name: f"{i:05d}" for i, name in enumerate(scene.files)}
+    geometries: dict[str, HrGeometry] = {}
+    phrases: dict[str, list[str]] = defaultdict(list)
+    usable = _usable(scene, conf, headers, left_out, images.decode)
+    sizes: list[tuple[int, int]] = []  # the largest is the first
+    for name, hr, picture in progress(usable, "HR views", "view", len(headers)):
+        file = f"{numbers[name]}.png"
+        own_mask, of_mask = given.read(name, headers[name])
+        mask = _used(picture, own_mask, scene)
+        image, shown = _layers(picture, mask, scene)
+        if not _save_hr(work, file, image, shown, mask, hr):
+            left_out[name] = "its mask leaves no pixel"
+            continue
+        if for_sfm:
+            sizes.append(headers[name].size)
+            _save_sfm(work, file, image, mask, _sfm_size(sizes[-1], sizes, conf))
+        geometries[name] = hr
+        for phrase in (*_phrases(picture, scene), *filter(None, [of_mask])):
+            phrases[phrase].append(name)
+    photos = _photographs(scene, conf, headers, left_out, geometries)
+    return PhotoCollection(photos, work, (*given.notes, *_notes(scene, left_out, phrases)))
+
+
+def expected_photographs(scene: Scene, conf: VariantConf) -> PhotoCollection:
+    """Say from headers alone what `prepare_hr_views` will make, as far as the files can be decoded.
+
+    Returns:
+        The photographs, without copies, and a note on those that will be left out.
+
+    Raises:
+        UnreadableError: A header can't be read now.
+        XrgsError: As `prepare_hr_views`.
+    """
+    headers, left_out = _read_headers(scene.files)
+    usable = _usable(scene, conf, headers, left_out, lambda _: None)
+    geometries = {name: hr for name, hr, _ in usable}
+    photos = _photographs(scene, conf, headers, left_out, geometries)
+    notes = (*Masks.fitted(scene.masks, headers).notes, *_notes(scene, left_out, {}))
+    return PhotoCollection(photos, Path(), notes)
+
+
+def _usable(
+    scene: Scene,
+    conf: VariantConf,
+    headers: Mapping[str, images.Header],
+    left_out: dict[str, str],
+    read: Callable[[Path], _Content],
+) -> Iterator[tuple[str, HrGeometry, _Content]]:
+    """Yield name, HR view and content of each photograph that can be used; fill `left_out`."""
+    shrink: float | None = None
+    # Largest first: the first that can be read sets the factor, a damaged file never does.
+    for name in sorted(headers, key=lambda name: max(headers[name].size), reverse=True):
+        file, size = scene.files[name], headers[name].size
+        try:
+            content = read(file)
+            shrink = shrink or shrink_factor([size], conf.long_side)
+            hr = _checked_geometry(size, shrink, conf)
+        except images.ImageError as error:
+            left_out[name] = str(error).removeprefix(f"{file}: ")
+            continue
+        except TooSmallError as error:
+            left_out[name] = error.why
+            continue
+        except UnreadableError:
+            raise
+        except XrgsError as error:
+            raise XrgsError(f"{file}: {error}") from None
+        yield name, hr, content
+
+
+def _photographs(
+    scene: Scene,
+    conf: VariantConf,
+    headers: Mapping[str, images.Header],
+    left_out: Mapping[str, str],
+    geometries: Mapping[str, HrGeometry],
+) -> tuple[Photograph, ...]:
+    """Describe the photographs that can be used, sorted by name; refuse fewer than two."""
+    if len(geometries) < 2:
+        count = f"{len(geometries)} photograph(s) can be used, two are needed"
+        reasons = f"{scene.name}: {count}: {_reasons(scene, left_out)}"
+        sizes = [header.size for header in headers.values()]
+        try:
+            for size in sizes:
+                hr_geometry(size, shrink_factor(sizes, conf.long_side), conf)
+        except TooSmallError as error:
+            reasons += f"; {error.advice}"
+        raise XrgsError(f"scene {reasons}")
+    numbers = {name: f"{i:05d}" for i, name in enumerate(scene.files)}
+    names = sorted(geometries)
+    files, sizes = [scene.files[name] for name in names], [headers[name].size for name in names]
+    taken = [exif.read(file) for file in files]
+    shapes, cameras = largest_of_shape(sizes), assign_cameras(files, sizes, conf.sfm.camera)
+    return tuple(
+        Photograph(
+            name=name,
+            number=numbers[name],
+            size=headers[name].size,
+            orientation=headers[name].orientation,
+            hr=geometries[name],
+            sfm=_sfm_size(shape, sizes, conf),
+            camera=camera,
+            K=scene.intrinsics.get(name),
+            # Of a part of the picture, it may be the whole picture's.
+            focal_35mm=None if of.cut else of.focal_35mm,
+            path=scene.files[name],
+        )
+        for name, shape, camera, of in zip(names, shapes, cameras, taken, strict=True)
+    )
+
+
+def _used(picture: images.Picture, given: Mask | None, scene: Scene) -> Mask | None:
+    """Return which pixels of a photograph are used, by its mask and alpha; None where all are."""
+    used = np.ones(picture.pixels.shape[:2], np.bool_) if given is None else given
+    if scene.alpha == "mask" and picture.alpha is not None:
+        used = used & (picture.alpha >= images.OPAQUE_FROM)
+    return None if used.all() else used
+
+
+def _layers(
+    picture: images.Picture, mask: Mask | None, scene: Scene
+) -> tuple[images.ImageArray, images.ImageArray]:
+    """Return a photograph without the pixels that its mask hides, and as it is shown."""
+    shown = picture.pixels
+    if picture.alpha is not None:
+        shown = images.composite(shown, picture.alpha, scene.background)
+    image = picture.pixels if scene.alpha == "mask" else shown
+    return masks.filled(image, mask), shown
+
+
+def _save_hr(
+    work: Path,
+    file: str,
+    image: images.ImageArray,
+    shown: images.ImageArray,
+    mask: Mask | None,
+    hr: HrGeometry,
+) -> bool:
+    """Write the HR view of a photograph, with its mask; return whether any pixel is used."""
+    if mask is not None:
+        small = _crop(masks.resized(mask, *hr.resized), hr)
+        if not small.any():
+            return False
+        if not small.all():
+            images.save(work / "shown" / file, _resize_and_crop(shown, hr), durable=False)
+            images.save_mask(copy_mask(work, f"hr/{file}"), small, durable=False)
+    images.save(work / "hr" / file, _resize_and_crop(image, hr), durable=False)
+    return True
+
+
+def _save_sfm(
+    work: Path, file: str, image: images.ImageArray, mask: Mask | None, size: tuple[int, int]
+) -> None:
+    """Write the copy of a photograph for SfM, with its mask."""
+    images.save(work / "sfm" / file, images.resize(image, *size), durable=False)
+    small = masks.resized(mask, *size)
+    if small is not None and not small.all():
+        images.save_mask(copy_mask(work, f"sfm/{file}"), small, durable=False)
+
+
+def _notes(
+    scene: Scene, left_out: Mapping[str, str], phrases: Mapping[str, Sequence[str]]
+) -> Iterator[str]:
+    """Yield a sentence on what was left out, and one on each thing that was done."""
+    if left_out:
+        yield f"left out: {_reasons(scene, left_out)}"
+    for phrase, names in sorted(phrases.items()):
+        yield f"{phrase}: {listed([_own_name(scene, name) for name in sorted(names)])}"
+
+
+def _reasons(scene: Scene, left_out: Mapping[str, str]) -> str:
+    """Name the photographs that are left out for each reason."""
+    names = defaultdict(list)
+    for name, why in sorted(left_out.items()):
+        names[why].append(_own_name(scene, name))
+    return "; ".join(f"{listed(own)} ({why})" for why, own in names.items())
+
+
+def _own_name(scene: Scene, name: str) -> str:
+    return f"{name}{scene.files[name].suffix}"
+
+
+def _phrases(picture: images.Picture, scene: Scene) -> Iterator[str]:
+    """Say what was done to a picture."""
+    if picture.orientation > 1:
+        yield "turned upright by EXIF"
+    yield from picture.notes
+    if picture.alpha is not None:
+        colour = ", ".join(f"{value:g}" for value in scene.background)
+        yield (
+            f"masked where alpha is below {images.OPAQUE_FROM:g} (scene.alpha=mask)"
+            if scene.alpha == "mask"
+            else f"transparent pixels laid over the colour [{colour}] of scene.background"
+        )
+
+
+def _checked_geometry(size: tuple[int, int], shrink: float, conf: VariantConf) -> HrGeometry:
+    hr = hr_geometry(size, shrink, conf)
+    if hr.width * hr.height > images.MAX_PNG_PIXELS:
+        raise XrgsError(
+            f"an HR view of {hr.width}x{hr.height} px has more than {images.MAX_PNG_PIXELS} "
+            f"pixels; lower variant.long_side={conf.long_side}"
+        )
+    return hr
+
+
+def _sfm_size(
+    size: tuple[int, int], sizes: Sequence[tuple[int, int]], conf: VariantConf
+) -> tuple[int, int]:
+    shrink = shrink_factor(sizes, conf.sfm.long_side)
+    return max(1, round(size[0] * shrink)), max(1, round(size[1] * shrink))
+
+
+def _resize_and_crop(image: images.ImageArray, hr: HrGeometry) -> images.ImageArray:
+    return _crop(images.resize(image, *hr.resized), hr)
+
+
+def _crop(image: NDArray[_T], hr: HrGeometry) -> NDArray[_T]:
+    left, top = hr.crop_offset
+    return image[top : top + hr.height, left : left + hr.width]
+
+
+def _read_headers(
+    files: Mapping[str, Path],
+) -> tuple[dict[str, images.Header], dict[str, str]]:
+    """Read the header of each file that may be a photograph, and say why each other is none."""
+    headers: dict[str, images.Header] = {}
+    left_out: dict[str, str] = {}
+    for name, file in files.items():
+        try:
+            headers[name] = images.header(file)
+        except images.ImageError as error:
+            left_out[name] = str(error).removeprefix(f"{file}: ")
+    depth = [name for name, header in headers.items() if header.is_deep_grey]
+    if len(depth) < len(headers):
+        for name in depth:
+            del headers[name]
+            left_out[name] = (
+                "taken for a depth map: it has one channel of more than 8 bits, and others have not"
+            )
+    return headers, left_out
+
+
+def largest_of_shape(sizes: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Return for each width and height the largest of `sizes` that has its aspect ratio.
+
+    Resized copies round their sides, so that ratios agree where one px explains the difference.
+    """
+    distinct = sorted(set(sizes), key=math.prod, reverse=True)
+
+    def largest(width: int, height: int) -> tuple[int, int]:
+        return next(s for s in distinct if abs(width * s[1] / s[0] - height) <= 1)
+
+    return [largest(*size) for size in sizes]
+
+
+def assign_cameras(
+    files: Sequence[Path], sizes: Sequence[tuple[int, int]], policy: str
+) -> list[str]:
+    """Name the camera of each photograph; photographs with one name share it in SfM.
+
+    Args:
+        files: The photographs.
+        sizes: Their width and height with the EXIF orientation applied, px: a camera held upright
+            is another camera to SfM. All photographs with one name have one aspect ratio.
+        policy: `variant.sfm.camera`: `single` for one camera, `per_image` for one each, `auto` for
+            one per aspect ratio and EXIF camera, digital zoom and crop.
+
+    Raises:
+        XrgsError: The policy is `single`, but the aspect ratios differ.
+    """
+    shapes = largest_of_shape(sizes)
+    if policy == "single":
+        if len(set(shapes)) > 1:
+            other = next(i for i, shape in enumerate(shapes) if shape != shapes[0])
+            a, b = (f"{files[i]} is {sizes[i][0]}x{sizes[i][1]}" for i in (0, other))
+            raise XrgsError(
+                f"variant.sfm.camera=single, but shapes differ: {a}, {b}; use auto or per_image"
+            )
+        return ["all"] * len(files)
+    own = [f"{i:05d}" for i in range(len(files))]
+    if policy == "per_image":
+        return own
+    taken = [exif.read(file) for file in files]
+    unknown = [size for size, of in zip(sizes, taken, strict=True) if not of.camera]
+    # Two tourists' photographs of one size are a coincidence; a camera takes many of its size.
+    by_size = len(set(sizes)) == 1 or len(unknown) >= _LEAST_OF_SIZE * len(set(unknown))
+    names = []
+    for i, (size, shape, of) in enumerate(zip(sizes, shapes, taken, strict=True)):
+        if of.camera:
+            names.append(f"{shape[0]}x{shape[1]} {of.camera} {of.cut}")
+        else:
+            names.append(f"{size[0]}x{size[1]} {of.cut}" if by_size else own[i])
+    return names
+
+
+def write_degraded(
+    photos: PhotoCollection, which: Sequence[int], conf: VariantConf, kind: str = "lr"
+) -> None:
+    """Degrade views of these indices: the HR views into `lr`, or the `sfm` copies into `sfm_lr`."""
+    if not which:
+        return
+    degrade = DEGRADATIONS[resolve_degradation(conf)].function
+    for i in progress(which, "LR views", "view"):
+        source = "hr" if kind == "lr" else "sfm"
+        high, mask = photos.read(source, i), photos.mask(source, i)
+        if kind == "sfm_lr":  # an HR view has been cropped to such a size
+            size = _divisible(*photos.size("sfm", i), conf.factor)
+            high, mask = images.resize(high, *size), masks.resized(mask, *size)
+        low = degrade(high, conf, _random(photos.names[i], conf))
+        images.save(photos.folder / photos.file(kind, i), low, durable=False)
+        photos.save_mask(kind, i, masks.degraded(mask, low.shape[:2], conf.factor))
+
+
+def _random(name: str, conf: VariantConf) -> np.random.Generator:
+    """Return a source of random numbers for a view, whatever the order of the views."""
+    return np.random.default_rng(int(digest([conf.seed, name]), 16))
+
+
+def _divisible(width: int, height: int, factor: int) -> tuple[int, int]:
+    """Return a size with sides that are multiples of `factor`, at most 2% smaller than this one.
+
+    Of these sizes it has the aspect ratio that is closest to the given one.
+    """
+    most = max(1, width // factor)
+    columns = min(
+        range(most, most - 1 - most // 50, -1),
+        key=lambda c: abs(c * height / width - round(c * height / width)),
+    )
+    return columns * factor, max(1, round(columns * height / width)) * factor

@@ -1,0 +1,329 @@
+"""Takes cameras and points from files of the user's in place of a new SfM: `variant.poses`.
+
+A model of COLMAP is read, or a transforms.json. A pose belongs to the photograph whose path ends
+with the same folders and name, whatever the suffix.
+
+Nothing here imports pycolmap before cameras are read.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from contextlib import contextmanager
+from dataclasses import replace
+from difflib import get_close_matches
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from xrgs.errors import UnreadableError, XrgsError
+from xrgs.mixture.poses import checks, colmap, transforms, world
+from xrgs.mixture.poses.given import MIN_POINTS
+from xrgs.photos import foreign, images
+from xrgs.photos.lens import Lens, quarter_turn
+from xrgs.runtime.text import listed
+from xrgs.safeio.files import is_transient
+from xrgs.safeio.hashing import file_digest
+from xrgs.safeio.paths import user_path
+from xrgs.safeio.sanitize import for_line
+from xrgs.splat.normalize import camera_positions
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterator, Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from xrgs.mixture.photographs import PhotoCollection, Photograph
+    from xrgs.mixture.sfm import Reconstruction
+    from xrgs.photos.scenes import Scene
+
+#: The clockwise quarters that EXIF's orientation turns stored pixels by; the others mirror them.
+_QUARTERS = {1: 0, 3: 2, 6: 1, 8: 3}
+#: A photograph of which undistortion keeps less is named.
+_LEAST_KEPT = 0.9
+
+
+def fingerprint(path: str) -> str:
+    """Hash the files that poses are read from: 64 hexadecimal digits of a SHA-256.
+
+    It does not depend on where the files are.
+
+    Raises:
+        UnreadableError: A file can't be read now.
+        XrgsError: Files are missing, or their layout is not one of the two.
+    """
+    sha256 = hashlib.sha256()
+    with _errors_named(path):
+        source = _source(path)
+        found = colmap.files(source) if isinstance(source, Path) else transforms.files(source)
+        for file in found:
+            sha256.update(f"{file.name}\0{file_digest(file)}\n".encode())
+    return sha256.hexdigest()
+
+
+@contextmanager
+def _errors_named(path: str) -> Iterator[None]:
+    """Begin each error with the key; an error of a file may be transient."""
+    try:
+        yield
+    except OSError as error:
+        kind = UnreadableError if is_transient(error) else XrgsError
+        raise kind(f"variant.poses={path}: {error.filename}: {error.strerror}") from error
+    except UnreadableError:
+        raise
+    except XrgsError as error:
+        raise XrgsError(f"variant.poses={path}: {error}") from error
+
+
+def _source(path: str) -> Path | list[Path]:
+    """Return the folder of COLMAP's models, or the transforms.json, or its parts."""
+    root = user_path(path)
+    if not root.exists():
+        raise XrgsError("no such folder or file")
+    if not root.is_dir():
+        foreign.check_file(root)
+        return [root]
+    if parts := transforms.in_folder(root):
+        return parts
+    if colmap.files(root):
+        return root
+    raise XrgsError(
+        "it must have a transforms.json, or cameras, images and points3D (which may be missing), "
+        "all .bin or all .txt; COLMAP's folder is often called sparse/0"
+        f"{foreign.in_folder(root)}"
+    )
+
+
+def with_masks(scene: Scene, path: str | None) -> Scene:
+    """Return a scene with the masks that `variant.poses` names, where it has no masks itself.
+
+    Raises:
+        As `read_poses`.
+    """
+    if path is None:
+        return scene
+    with _errors_named(path):
+        source = _source(path)
+        masks = {} if isinstance(source, Path) else transforms.masks(source)
+        if not masks:
+            return scene
+        if scene.masks:
+            note = "mask_path of variant.poses is not read, since scene.masks has masks"
+            return replace(scene, notes=(*scene.notes, note))
+        found, names = match_names(list(masks), list(scene.files.items())), list(scene.files)
+    given = {names[i]: masks[pose] for pose, i in found.items()}
+    note = f"the masks of {len(given)} photographs are those of mask_path in variant.poses"
+    return replace(scene, masks=given, notes=(*scene.notes, note))
+
+
+def read_poses(path: str, photos: PhotoCollection) -> Reconstruction:
+    """Read the cameras of the HR views of photographs, and all points, from `variant.poses`.
+
+    Raises:
+        UnreadableError: A file can't be read now.
+        XrgsError: The files are malformed, a camera model is not supported, no photograph has the
+            name of an image, or there are too few points. No points at all are no error.
+    """
+    from xrgs.mixture.sfm import Reconstruction
+
+    content = fingerprint(path)
+    with _errors_named(path):
+        source = _source(path)
+        if isinstance(source, Path):
+            given, in_folder = colmap.read(source), []
+        else:
+            given = transforms.read(source)
+            names = listed([file.name for file in source])
+            in_folder = [f"variant.poses: {names} is read"] if user_path(path).is_dir() else []
+        with np.errstate(over="ignore"):  # training is in 32 bits
+            usable = np.isfinite(given.points.astype(np.float32)).all(axis=1)
+        points = given.points[usable]
+        if len(given.points) and len(points) < max(MIN_POINTS, len(given.points)):
+            raise XrgsError(
+                f"{len(points)} of {len(given.points)} points are usable; at least {MIN_POINTS} "
+                "points, all of them finite, are needed to begin training with"
+            )
+        found = match_names(given.names, [(photo.name, photo.path) for photo in photos.all])
+        cameras = {i: given.camera(name, _stored(photos[i])) for name, i in found.items()}
+        turned = _turned_by_exif({i: lens for i, (lens, _) in cameras.items()}, photos)
+        cameras |= {i: _upright(*cameras[i], photos[i]) for i in turned}
+        for i, (lens, _) in cameras.items():
+            checks.check_camera(lens, photos[i])
+        given_lenses = {i: lens for i, (lens, _) in cameras.items()}
+        names_of = {i: name for name, i in found.items()}
+        in_folder += checks.of_other_pictures(given_lenses, names_of, photos, user_path(path))
+        viewmats, moved = world.own_world({i: viewmat for i, (_, viewmat) in cameras.items()})
+        points, rounded = _moved_points(points, viewmats, moved)
+        lenses = {i: photos[i].to_hr(lens) for i, (lens, _) in cameras.items()}
+        kept = {i: lens.kept() for i, lens in lenses.items()}
+    notes = _notes(given.names, found, photos, lenses, kept, turned)
+    none = np.zeros(0, np.intp)
+    return Reconstruction(
+        lenses,
+        viewmats,
+        points,
+        given.colors[: len(points)],
+        {i: none if rounded else given.observed.get(name, none) for name, i in found.items()},
+        {
+            "poses": content,
+            "images": len(photos),
+            "registered": len(lenses),
+            "points": len(points),
+            **given.report,
+            "notes": [for_line(note) for note in (*in_folder, *given.notes, *rounded, *notes)],
+        },
+        moved,
+    )
+
+
+def _moved_points(
+    points: NDArray[np.float64],
+    viewmats: Mapping[int, NDArray[np.float64]],
+    to: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], list[str]]:
+    """Move points to the world of the cameras; drop those that are rounded too much, and say so."""
+    own, notes = world.moved_points(points, to), []
+    if step := world.rounding(points, own):
+        far = float(np.abs(points).max())
+        notes.append(
+            f"the points of variant.poses are not used: 32 bits round them to steps of {step:.2g}, "
+            f"since they are {far:.2g} from the origin; save them in 64 bits (double)"
+        )
+        own = own[:0]
+    centres = camera_positions(np.stack([*viewmats.values()]))
+    checks.check_places(centres, own, float(np.linalg.norm(to[:3, 3])))
+    return own, notes
+
+
+def _stored(photo: Photograph) -> tuple[int, int]:
+    """Return the width and height that a photograph is stored with, before EXIF turns it."""
+    return images.turned_size(photo.size, photo.orientation)
+
+
+def _turned_by_exif(lenses: Mapping[int, Lens], photos: PhotoCollection) -> set[int]:
+    """Return the photographs that EXIF turns away from the pixels of their cameras.
+
+    COLMAP, nerfstudio and instant-ngp take pixels as they are stored, but may have got copies that
+    were upright already. A camera that has the shape of one alone decides for itself, and for those
+    that fit both ways: of square photographs, and of ones that EXIF turns by 180 degrees. Where all
+    fit both ways, the pixels are taken to be as stored.
+    """
+    stored, upright, either = set[int](), set[int](), set[int]()
+    for i, lens in lenses.items():
+        shape, photo = (lens.width, lens.height), photos[i]
+        if photo.orientation != 1 and checks.same_shape(shape, _stored(photo)):
+            (either if checks.same_shape(shape, photo.size) else stored).add(i)
+        elif photo.orientation != 1:
+            upright.add(i)
+    return stored if upright and not stored else stored | either
+
+
+def _upright(
+    lens: Lens, viewmat: NDArray[np.float64], photo: Photograph
+) -> tuple[Lens, NDArray[np.float64]]:
+    """Turn a camera and its pose as EXIF turns the photograph."""
+    quarters = _QUARTERS.get(photo.orientation)
+    if quarters is None:
+        raise XrgsError(
+            f"EXIF's orientation {photo.orientation} mirrors {photo.name}, and no camera shows a "
+            "mirrored picture: remove the tag, or place upright copies of the photographs"
+        )
+    turn = np.eye(4)
+    turn[:2, :2] = quarter_turn(quarters)
+    return lens.turned(quarters), turn @ viewmat
+
+
+def _notes(
+    names: Sequence[str],
+    found: Mapping[str, int],
+    photos: PhotoCollection,
+    lenses: Mapping[int, Lens],
+    kept: Mapping[int, float],
+    turned: Collection[int],
+) -> list[str]:
+    notes = []
+    if unused := [name for name in names if name not in found]:
+        notes.append(f"{len(unused)} poses fit no photograph, or several: {listed(unused)}")
+    if turned:
+        names_of_turned = [photos.names[i] for i in sorted(turned)]
+        notes.append(
+            f"EXIF turns {len(turned)} photographs, and their poses were turned with them, since "
+            f"the pixels that were posed are taken to be as stored: {listed(names_of_turned)}"
+        )
+    if cut := sorted(i for i, share in kept.items() if share < _LEAST_KEPT):
+        models = ", ".join(sorted({lenses[i].model for i in cut}))
+        shares = [kept[i] for i in cut]
+        notes.append(
+            f"undistortion keeps {min(shares):.0%} to {max(shares):.0%} of {len(cut)} photographs "
+            f"with cameras {models}: {listed([photos.names[i] for i in cut])}"
+        )
+    return notes
+
+
+def match_names(poses: Sequence[str], photographs: Sequence[tuple[str, Path]]) -> dict[str, int]:
+    """Find the photograph of each pose, by the end of its path.
+
+    Args:
+        poses: The names of images in a file of poses, with folders and suffix.
+        photographs: The name and the file of each photograph.
+
+    Returns:
+        The index of the photograph by the name of the pose. Of several poses that fit a photograph,
+        the one that shares most folders with it has it; poses that fit several are left out.
+
+    Raises:
+        XrgsError: No pose has a photograph, or two poses fit one photograph alike.
+    """
+    ends: dict[str, set[int]] = {}  # the photographs by how their paths may end
+    for i, (name, file) in enumerate(photographs):
+        for end in (name, file.stem):
+            ends.setdefault(end, set()).add(i)
+    fits: dict[int, list[tuple[int, str]]] = {}
+    for pose in poses:
+        parts = _parts(pose)
+        same_end = set().union(*(ends.get("_".join(parts[n:]), ()) for n in range(len(parts))))
+        scores = {i: score for i in same_end if (score := _shared(parts, *photographs[i]))}
+        best = [i for i, score in scores.items() if score == max(scores.values())]
+        if len(best) == 1:
+            fits.setdefault(best[0], []).append((scores[best[0]], pose))
+    if not fits:
+        names = [name for name, _ in photographs]
+        similar = [m for p in poses[:1] for m in get_close_matches(Path(p).stem, names, 1, 0.0)]
+        example = f": {poses[0]} is not {similar[0]}" if similar else ""
+        why = f"none of its {len(poses)} images has the name of a photograph{example}"
+        raise XrgsError(f"{why}; rename them")
+    found = {}
+    for i, claims in fits.items():
+        most = max(score for score, _ in claims)
+        first, *others = [pose for score, pose in claims if score == most]
+        if others:
+            raise XrgsError(
+                f"two of its images, {first} and {others[0]}, have the name of the photograph "
+                f"{photographs[i][0]}; rename them, or remove one"
+            )
+        found[first] = i
+    return found
+
+
+def _parts(path: str) -> tuple[str, ...]:
+    """Return the folders and the name, without suffix, of a path of any system."""
+    pure = PurePosixPath(path.replace("\\", "/"))
+    # Blender and other programs leave the suffix out: the end of frame.0001 is none.
+    return pure.parts if pure.suffix[1:].isdigit() or not pure.name else pure.with_suffix("").parts
+
+
+def _shared(pose: Sequence[str], name: str, file: Path) -> int:
+    """Return how many parts at its end the path of a pose shares with a photograph.
+
+    The folders below `scene.path` are in the name of a photograph: the view of rig1/0004.jpg is
+    rig1_0004. They must agree as far as the pose has folders.
+    """
+    own = file.with_suffix("").parts
+    shared = 0
+    while shared < min(len(own), len(pose)) and own[-1 - shared] == pose[-1 - shared]:
+        shared += 1
+    below = next((n for n in range(1, len(own)) if "_".join(own[-n:]) == name), 1)
+    if shared >= min(below, len(pose)):
+        return shared
+    return next((n for n in range(len(pose), 0, -1) if "_".join(pose[-n:]) == name), 0)

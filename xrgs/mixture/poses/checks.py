@@ -1,0 +1,147 @@
+"""Refuses given cameras that can't be, and names those of other pictures than the photographs."""
+
+from __future__ import annotations
+
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from xrgs.errors import XrgsError
+from xrgs.photos import images
+from xrgs.runtime.text import listed
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from xrgs.mixture.photographs import PhotoCollection, Photograph
+    from xrgs.photos.lens import Lens
+
+#: The largest difference of the aspect ratios of an image and its photograph, which rounding of
+#: their sides to whole px explains.
+_MAX_ASPECT = 0.01
+#: The focal length over the longer side, from 157 degrees (COLMAP's own limit) to half a degree.
+_FOCAL_RANGE = (0.1, 100.0)
+#: The most that pixels are longer one way than the other; anamorphic lenses have 2.
+_MAX_PIXEL_ASPECT = 3.0
+#: How many times as many px a side a picture has as its smaller copy, at most.
+_MOST_SMALLER = 16
+#: Cameras that are closer together than this share of the distance of their points see no depth:
+#: points move by a tenth of a pixel from one to the other. Our choice.
+_LEAST_BASELINE = 1e-4
+#: Differences of large numbers in 64 bits that are only rounded.
+_ROUNDING = 1e-14
+
+
+def same_shape(a: tuple[int, int], b: tuple[int, int]) -> bool:
+    """Return whether two sizes have one aspect ratio."""
+    return abs(a[0] * b[1] / (a[1] * b[0]) - 1) <= _MAX_ASPECT
+
+
+def check_camera(lens: Lens, photo: Photograph) -> None:
+    """Refuse the camera of another picture, and a camera that can't be.
+
+    Args:
+        lens: The camera of the upright photograph, at the size that the file of poses has.
+        photo: The photograph.
+
+    Raises:
+        XrgsError: The shapes differ, or the focal length or the principal point can't be.
+    """
+    size = lens.width, lens.height
+    if not same_shape(size, photo.size):
+        raise XrgsError(
+            f"the camera of {photo.name} is for images of {size[0]}x{size[1]} px, and the "
+            f"photograph has {photo.size[0]}x{photo.size[1]}: these are not the same picture"
+        )
+    fx, fy, cx, cy = lens.K[0, 0], lens.K[1, 1], lens.K[0, 2], lens.K[1, 2]
+    shown = f"the camera of {photo.name}, for {size[0]}x{size[1]} px, "
+    least, most = (limit * max(size) for limit in _FOCAL_RANGE)
+    if not least <= min(fx, fy) <= max(fx, fy) <= most:
+        raise XrgsError(
+            f"{shown}has a focal length of {fx:g} and {fy:g} px; {least:g} to {most:g} px can be "
+            "(a focal length is in px, and camera_angle_x in radians)"
+        )
+    if max(fx, fy) > _MAX_PIXEL_ASPECT * min(fx, fy):
+        raise XrgsError(f"{shown}has focal lengths of {fx:g} and {fy:g} px, too unequal")
+    if abs(cx / size[0] - 0.5) > 1.5 or abs(cy / size[1] - 0.5) > 1.5:
+        raise XrgsError(f"{shown}has its principal point at {cx:g}, {cy:g} px, far outside of it")
+
+
+def check_places(centres: NDArray[np.float64], points: NDArray[np.float64], far: float) -> None:
+    """Refuse cameras that are all at one place, from which nothing has a depth.
+
+    Args:
+        centres: The cameras [N, 3], their mean at the origin.
+        points: The points [P, 3] around the same origin; there may be none.
+        far: How far this origin is from that of the given world, whose numbers are rounded.
+
+    Raises:
+        XrgsError: They are.
+    """
+    extent = np.linalg.norm(centres, axis=1).max()
+    distance = float(np.median(np.linalg.norm(points, axis=1))) if len(points) else 0.0
+    if len(centres) > 1 and extent <= max(_LEAST_BASELINE * distance, _ROUNDING * far):
+        raise XrgsError(
+            f"all {len(centres)} cameras are at one place, so that nothing has a depth; "
+            "are these the poses of a panorama, or has every frame the same matrix?"
+        )
+
+
+def of_other_pictures(
+    lenses: Mapping[int, Lens], names: Mapping[int, str], photos: PhotoCollection, source: Path
+) -> list[str]:
+    """Say which cameras are of pictures that are neither the photographs nor smaller copies.
+
+    These may be the images that COLMAP undistorted, whose sides differ by a few px.
+
+    Args:
+        lenses: The cameras of upright photographs by index, at the sizes that the poses have.
+        names: The names that the images have in the poses.
+        photos: The photographs.
+        source: The file or folder of the poses.
+
+    Raises:
+        XrgsError: The pictures are beside the poses, at exactly the cameras' sizes.
+    """
+    odd = [i for i, of in lenses.items() if not _is_copy((of.width, of.height), photos[i].size)]
+    for i in odd:
+        size = lenses[i].width, lenses[i].height
+        for folder in (source, *source.absolute().parents[:3]):
+            for file in (folder / "images" / names[i], folder / PurePosixPath(names[i])):
+                if _size(file) == size:
+                    raise XrgsError(
+                        f"its cameras are of {file.parent}, where {file.name} has "
+                        f"{size[0]}x{size[1]} px, and not of {photos[i].path}, which has "
+                        f"{photos[i].size[0]}x{photos[i].size[1]}: undistortion changes the "
+                        f"picture; take scene.path={file.parent}"
+                    )
+    if not odd:
+        return []
+    lens, size = lenses[odd[0]], photos[odd[0]].size
+    of_odd = listed([photos.names[i] for i in odd])
+    return [
+        f"the cameras of {len(odd)} photographs are of images of another size, as "
+        f"{lens.width}x{lens.height} for {size[0]}x{size[1]} px: right for resized copies, and "
+        f"wrong for images that were undistorted or cropped: {of_odd}"
+    ]
+
+
+def _size(file: Path) -> tuple[int, int] | None:
+    try:
+        return images.size(file)
+    except XrgsError:
+        return None
+
+
+def _is_copy(size: tuple[int, int], photograph: tuple[int, int]) -> bool:
+    """Return whether a size is a photograph's, or one of the two is a whole number smaller."""
+    if size == photograph:
+        return True
+    small, large = sorted((size, photograph))
+    return any(
+        all(abs(s - side / n) < 1 for s, side in zip(small, large, strict=True))
+        for n in range(2, _MOST_SMALLER + 1)
+    )

@@ -1,0 +1,434 @@
+"""Runs structure from motion with pycolmap: finds the cameras and points of a set of images.
+
+COLMAP's own log goes to files in the work folder; the user sees one progress bar per stage.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import zlib  # noqa: F401  pycolmap 4.2.1 corrupts the heap where it is imported before zlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from xrgs.mixture.own_cameras import other_cameras
+from xrgs.photos import images
+from xrgs.photos.lens import Lens, lens_of_model
+from xrgs.photos.masks import MASKS
+from xrgs.runtime.machine import usable_cores
+from xrgs.runtime.progress import ProgressBar
+from xrgs.runtime.signals import handlers_kept
+from xrgs.runtime.text import listed
+
+if TYPE_CHECKING:
+    from xrgs.config import SfmConf
+
+with handlers_kept():
+    import pycolmap
+
+#: The number of features in all images with which exhaustive matching takes minutes on two cores.
+_TOTAL_FEATURES = 100_000
+#: COLMAP's own default of `max_num_features`, per image.
+_MAX_FEATURES = 8192
+#: The longer side, px, up to which features are detected at twice the resolution: half of the
+#: default of `variant.sfm.long_side`, so that SIFT takes no longer than at that size.
+_SMALL_SIDE = 800
+#: The smallest triangulation angle for two views of a narrow baseline, degrees.
+_TWO_VIEW_ANGLE = 0.2
+#: The inliers of the first pair over the inliers of a later view: COLMAP's defaults of
+#: `init_min_num_inliers` and `abs_pose_min_num_inliers`.
+_FIRST_PAIR_RATIO = 100 / 30
+#: The entries of K that are the parameters of COLMAP's PINHOLE camera.
+_PINHOLE_ENTRIES = ((0, 0), (1, 1), (0, 2), (1, 2))
+
+
+@dataclass(frozen=True)
+class SfmImage:
+    """One image that SfM is to register."""
+
+    file: str
+    """Its path, relative to the folder of all images."""
+    name: str
+    """The photograph's name, for messages."""
+    camera: str
+    """The name of its camera; images with one name share the camera."""
+    K: NDArray[np.float64] | None = None
+    """Intrinsics [3, 3], px, where they are known: then there is no distortion, and they are not
+    refined."""
+    focal: float | None = None
+    """The focal length that EXIF gives, px: refinement begins with it."""
+    masked: bool = False
+    """Whether it has a mask, `xrgs.photos.masks.copy_mask` of its file: no features outside."""
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """COLMAP's largest model, empty where there is none; keys are indices of the images."""
+
+    lenses: dict[int, Lens]
+    """The camera of each registered image, in that image's px."""
+    viewmats: dict[int, NDArray[np.float64]]
+    """World to camera [4, 4], OpenCV axes."""
+    points: NDArray[np.float64]
+    """SfM points [P, 3]."""
+    colors: NDArray[np.uint8]
+    """Their colours [P, 3]."""
+    observed: dict[int, NDArray[np.intp]]
+    """Indices of the points that were found in each image, ascending."""
+    report: dict[str, Any]
+    """Settings and results, by the keys that the variant's report has."""
+    world: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
+    """The rigid transform [4, 4] from the world of given poses to this one."""
+    apart: Mapping[int, int] = field(default_factory=dict)
+    """The images that fit better with another camera than the one that they share, as
+    `xrgs.mixture.own_cameras` numbers them."""
+
+
+def features_per_image(images: int, configured: int) -> int:
+    """Return `variant.sfm.max_num_features`; where it is 0, choose the features of one image.
+
+    The choice keeps exhaustive matching short, and is at most COLMAP's 8192.
+    """
+    return configured or min(_MAX_FEATURES, _TOTAL_FEATURES // max(images, 1))
+
+
+def first_octave(long_side: int, configured: int | None) -> int:
+    """Return `variant.sfm.first_octave`; where it is None, choose it: -1 up to 800 px, 0 above.
+
+    -1 detects features at twice the resolution. For small images it is better. On the embedded
+    scene with mixed resolution it gave 1.7 to 2 times the points and 3 to 21% less position error,
+    at 250 px and at 500 px. Of 37 photographs of bonsai (Mip-NeRF 360) at 800 px, LR ones at 160,
+    it placed 18 instead of 3.
+
+    Args:
+        long_side: The longest side of all images, px.
+        configured: The value of the key.
+    """
+    if configured is not None:
+        return configured
+    return -1 if long_side <= _SMALL_SIDE else 0
+
+
+def reconstruct(
+    sfm_images: Sequence[SfmImage], folder: Path, work: Path, conf: SfmConf
+) -> Reconstruction:
+    """Find cameras and points by exhaustive matching and incremental mapping.
+
+    With any number of threads, images have the same numbers and RANSAC makes the same draws. Some
+    90 runs with 1 and 3 threads on one kind of processor gave the same bits. One other run did not:
+    its focal length differed by 1/100,000, for a reason inside COLMAP that was not found. Another
+    kind of processor may give other last digits.
+
+    Args:
+        sfm_images: The images; those without `K` get one SIMPLE_RADIAL camera per `camera` name.
+        folder: The folder that `SfmImage.file` is relative to.
+        work: An existing folder for COLMAP's database, models and logs. Features and matches of
+            an earlier call with the same images, `max_num_features` and `first_octave` are reused.
+        conf: The settings.
+
+    Returns:
+        The largest model; empty where COLMAP found none.
+    """
+    _log_to(work)
+    pycolmap.set_random_seed(conf.seed)
+    database = work / "database.db"
+    features = _find_matches(sfm_images, folder, work, conf)
+    models = _map(sfm_images, folder, database, work, conf)
+    report = features | {
+        "images": len(sfm_images),
+        "init_min_tri_angle": conf.init_min_tri_angle,
+        "lr_images": conf.lr_images,
+        "min_inliers": conf.min_inliers,
+        "points": 0,
+        "pycolmap": pycolmap.__version__,
+        "registered": 0,
+        "models": sorted((model.num_reg_images() for model in models), reverse=True),
+        "notes": [],
+    }
+    if not models:
+        no_points = np.zeros((0, 3))
+        return Reconstruction({}, {}, no_points, no_points.astype(np.uint8), {}, report)
+    largest = max(models, key=lambda m: (m.num_reg_images(), m.num_points3D()))
+    bogus = bogus_cameras(largest, sfm_images)
+    report["notes"] = list(_notes(sfm_images, bogus))
+    index = {image.file: i for i, image in enumerate(sfm_images) if i not in bogus}
+    refined = {s.file: (i, s.camera) for i, s in enumerate(sfm_images) if s.K is None}
+    apart = other_cameras(largest, refined)
+    return replace(to_numpy(largest, index, report), apart=apart)
+
+
+def _notes(sfm_images: Sequence[SfmImage], bogus: Mapping[int, str]) -> Iterator[str]:
+    if bogus:
+        cameras = [f"{sfm_images[i].name} ({params})" for i, params in sorted(bogus.items())]
+        yield f"not placed, because SfM made an impossible camera: {listed(cameras)}"
+    if len(sfm_images) == 2 and all(i.K is None and i.focal is None for i in sfm_images):
+        yield (
+            "the focal length is a guess, 1.2 times the longer side: two photographs do not tell "
+            "it, and EXIF does not give it"
+        )
+
+
+def triangulate(
+    sfm_images: Sequence[SfmImage],
+    viewmats: Sequence[NDArray[np.float64]],
+    folder: Path,
+    work: Path,
+    conf: SfmConf,
+) -> Reconstruction:
+    """Find the points that images of known cameras and poses show, by exhaustive matching.
+
+    Args:
+        sfm_images: The images, each with `K` and a camera of its own.
+        viewmats: World to camera [4, 4] of each.
+        folder: The folder that `SfmImage.file` is relative to.
+        work: An existing folder for COLMAP's database and logs.
+        conf: The settings.
+    """
+    _log_to(work)
+    pycolmap.set_random_seed(conf.seed)
+    database = work / "database.db"
+    features = _find_matches(sfm_images, folder, work, conf)
+    index = {image.file: i for i, image in enumerate(sfm_images)}
+    posed = pycolmap.Reconstruction()
+    with pycolmap.Database.open(database) as opened:
+        for camera in opened.read_all_cameras():
+            posed.add_camera_with_trivial_rig(camera)
+        for image in opened.read_all_images():
+            pose = pycolmap.Rigid3d(viewmats[index[image.name]][:3])
+            posed.add_image_with_trivial_frame(image, pose)
+    options = mapping_options(conf, len(sfm_images), known=True)
+    model = pycolmap.triangulate_points(posed, database, folder, work, options=options)
+    return to_numpy(model, index, features)
+
+
+def _find_matches(
+    sfm_images: Sequence[SfmImage], folder: Path, work: Path, conf: SfmConf
+) -> dict[str, Any]:
+    """Fill the database in `work`, unless an earlier call has; return the settings of SIFT."""
+    database = work / "database.db"
+    max_features = features_per_image(len(sfm_images), conf.max_num_features)
+    longest = max(max(images.size(folder / image.file)) for image in sfm_images)
+    octave = first_octave(longest, conf.first_octave)
+    if not database.exists():
+        _name_cameras(sfm_images, folder, database)
+        _extract(sfm_images, folder, database, max_features, octave)
+        _match(sfm_images, database, work, conf.seed)
+    return {"first_octave": octave, "max_num_features": max_features}
+
+
+def bogus_cameras(model: Any, sfm_images: Sequence[SfmImage]) -> dict[int, str]:
+    """Find images whose camera is impossible, by COLMAP's own limits for its parameters.
+
+    COLMAP drops such images after every bundle adjustment but the last, so that a model may end
+    with a focal length below 0.
+
+    Args:
+        model: pycolmap's `Reconstruction`.
+        sfm_images: The images; the intrinsics of those with `K` are known, and are not judged.
+
+    Returns:
+        The parameters of the camera by the index of each such image.
+    """
+    limits = pycolmap.IncrementalMapperOptions()
+    refined = {image.file: i for i, image in enumerate(sfm_images) if image.K is None}
+    found = {}
+    for image in model.images.values():
+        camera = model.cameras[image.camera_id]
+        if (
+            image.has_pose
+            and image.name in refined
+            and camera.has_bogus_params(
+                limits.min_focal_length_ratio, limits.max_focal_length_ratio, limits.max_extra_param
+            )
+        ):
+            found[refined[image.name]] = camera.params_to_string()
+    return found
+
+
+def _log_to(work: Path) -> None:
+    """Send COLMAP's log to files in `work`, and not to the terminal."""
+    log = pycolmap.logging
+    log.logtostderr = log.alsologtostderr = False
+    log.stderrthreshold = int(log.FATAL.value)
+    for level in (log.INFO, log.WARNING, log.ERROR):
+        log.set_log_destination(level, str(work / f"colmap-{level.name}-"))
+
+
+def _name_cameras(sfm_images: Sequence[SfmImage], folder: Path, database: Path) -> None:
+    """Write images and cameras into a new database, in the order in which they are given.
+
+    Several threads that extract features would number images as they finish, and the numbers
+    decide the order of everything that follows.
+    """
+    with pycolmap.Database.open(database):
+        pass
+    groups: dict[str, list[SfmImage]] = {}
+    for image in sfm_images:
+        groups.setdefault(image.camera, []).append(image)
+    for group in groups.values():
+        first, reader = group[0], pycolmap.ImageReaderOptions()
+        if first.K is not None:
+            reader.camera_model = "PINHOLE"
+            values = (repr(float(first.K[i, j])) for i, j in _PINHOLE_ENTRIES)
+            reader.camera_params = ",".join(values)
+        elif first.focal is not None:
+            width, height = images.size(folder / first.file)
+            reader.camera_params = f"{float(first.focal)},{width / 2},{height / 2},0"
+        pycolmap.import_images(
+            database,
+            folder,
+            camera_mode=pycolmap.CameraMode.SINGLE,
+            image_names=[image.file for image in group],
+            options=reader,
+        )
+
+
+def _extract(
+    sfm_images: Sequence[SfmImage],
+    folder: Path,
+    database: Path,
+    max_features: int,
+    octave: int,
+) -> None:
+    threads = usable_cores()
+    options = pycolmap.FeatureExtractionOptions()
+    options.num_threads = threads
+    options.sift.max_num_features = max_features
+    options.sift.first_octave = octave
+    with ProgressBar("SfM: features", "view", len(sfm_images)) as bar:
+        for batch in _batches(sfm_images, 2 * threads):
+            reader = pycolmap.ImageReaderOptions()
+            if batch[0].masked:  # COLMAP drops an image whose mask it does not find
+                reader.mask_path = folder / MASKS
+            pycolmap.extract_features(
+                database,
+                folder,
+                image_names=[image.file for image in batch],
+                reader_options=reader,
+                extraction_options=options,
+                device=pycolmap.Device.cpu,
+            )
+            bar.update(len(batch))
+
+
+def _batches(sfm_images: Sequence[SfmImage], size: int) -> Iterator[list[SfmImage]]:
+    """Yield images a few at a time, so that progress can be shown in between.
+
+    Either all or none of them have masks.
+    """
+    for masked in (False, True):
+        group = [image for image in sfm_images if image.masked == masked]
+        for start in range(0, len(group), size):
+            yield group[start : start + size]
+
+
+def _match(sfm_images: Sequence[SfmImage], database: Path, work: Path, seed: int) -> None:
+    """Match every pair of images: one image at a time with all that come before it."""
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.num_threads = usable_cores()
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = seed  # for each pair, whichever thread verifies it
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = work / "pairs.txt"
+    pairs = len(sfm_images) * (len(sfm_images) - 1) // 2
+    with ProgressBar("SfM: matches", "pair", pairs) as bar:
+        for i in range(1, len(sfm_images)):
+            lines = [f"{image.file} {sfm_images[i].file}\n" for image in sfm_images[:i]]
+            (work / "pairs.txt").write_text("".join(lines), encoding="utf-8")
+            pycolmap.match_image_pairs(
+                database,
+                matching_options=matching,
+                pairing_options=pairing,
+                verification_options=verification,
+                device=pycolmap.Device.cpu,
+            )
+            bar.update(i)
+
+
+def _map(
+    sfm_images: Sequence[SfmImage], folder: Path, database: Path, work: Path, conf: SfmConf
+) -> list[Any]:
+    options = mapping_options(conf, len(sfm_images), known=all(s.K is not None for s in sfm_images))
+    out = Path(tempfile.mkdtemp(prefix="models-", dir=work))
+    with ProgressBar("SfM: cameras", "view", len(sfm_images)) as bar:
+        models = pycolmap.incremental_mapping(
+            database,
+            folder,
+            out,
+            options=options,
+            next_image_callback=lambda: bar.update(int(bar.n < len(sfm_images))),
+        )
+    return list(models.values())
+
+
+def mapping_options(conf: SfmConf, count: int, *, known: bool) -> Any:
+    """Return pycolmap's `IncrementalPipelineOptions` for the incremental mapping.
+
+    Args:
+        conf: The settings.
+        count: The number of images. With two, COLMAP's defaults would drop every point.
+        known: Whether the intrinsics of all images are known; they are then not refined.
+    """
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed = conf.seed
+    options.num_threads = 1  # several threads sum a bundle adjustment in another order each time
+    options.mapper.init_min_tri_angle = conf.init_min_tri_angle
+    options.mapper.abs_pose_min_num_inliers = conf.min_inliers
+    options.mapper.init_min_num_inliers = round(conf.min_inliers * _FIRST_PAIR_RATIO)
+    options.min_model_size = min(count, options.min_model_size)
+    if count == 2:
+        # By default a point that only two images observe is dropped, which is every one here.
+        options.triangulation.ignore_two_view_tracks = False
+        options.triangulation.min_angle = _TWO_VIEW_ANGLE
+        options.mapper.filter_min_tri_angle = _TWO_VIEW_ANGLE
+        options.mapper.init_min_tri_angle = _TWO_VIEW_ANGLE
+        options.mapper.init_max_forward_motion = 1.0
+    if known or count == 2:  # from two views, focal length and depth can't be told apart
+        options.ba_refine_focal_length = False
+        options.ba_refine_extra_params = False
+        options.mapper.abs_pose_refine_focal_length = False
+        options.mapper.abs_pose_refine_extra_params = False
+    return options
+
+
+def to_numpy(model: Any, index: Mapping[str, int], report: Mapping[str, Any]) -> Reconstruction:
+    """Convert pycolmap's `Reconstruction` into numpy arrays, the points in the order of their ids.
+
+    Args:
+        model: The model.
+        index: The index of each image by its name in the model; other images are left out.
+        report: What is reported beside the results.
+
+    Raises:
+        XrgsError: A camera model is not supported.
+    """
+    order = sorted(model.points3D)
+    number = {point: p for p, point in enumerate(order)}
+    lenses, viewmats, observed = {}, {}, {}
+    for image in model.images.values():
+        if not image.has_pose or image.name not in index:
+            continue
+        i = index[image.name]
+        viewmats[i] = np.vstack([image.cam_from_world().matrix(), [0.0, 0.0, 0.0, 1.0]])
+        camera = model.cameras[image.camera_id]
+        params = [float(value) for value in camera.params]
+        lenses[i] = lens_of_model(camera.model_name, (camera.width, camera.height), params)
+        own = {number[p.point3D_id] for p in image.points2D if p.has_point3D()}
+        observed[i] = np.array(sorted(own), dtype=np.intp)
+    points, colors = points_of(model)
+    results: dict[str, Any] = {"registered": len(viewmats), "points": len(points)}
+    if model.compute_num_observations():  # a model of another program may have none
+        results["reprojection_error_px"] = float(model.compute_mean_reprojection_error())
+    return Reconstruction(lenses, viewmats, points, colors, observed, {**report, **results})
+
+
+def points_of(model: Any) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Return the points [P, 3] of pycolmap's `Reconstruction` by id, and their colours [P, 3]."""
+    order = sorted(model.points3D)
+    points = np.array([model.points3D[p].xyz for p in order], dtype=np.float64).reshape(-1, 3)
+    colors = np.array([model.points3D[p].color for p in order], dtype=np.uint8).reshape(-1, 3)
+    return points, colors

@@ -1,0 +1,280 @@
+"""Registers the views of a mixed-resolution scene, with further attempts where too few register.
+
+SfM gets whole photographs at `sfm.long_side`, whatever the size that is trained. Photographs that
+the variant degrades are degraded at that size. With `sfm.lr_images: upsampled`, a smaller image is
+resized to the size of the largest of its shape, and one camera serves both. This makes the poses
+of small images several times more accurate. With `native`, SfM gets a smaller image as it is, with
+a camera of its size.
+
+The first attempt, `configured`, has the settings of `variant.sfm`. With `sfm.fallbacks`, the
+attempts of `FALLBACKS` follow in their order until a reconstruction is accepted. The first of them
+also follows where a reconstruction is accepted that lacks views. Where EXIF gives a focal length,
+which is the first guess of the others, an attempt without it comes second of them.
+
+Photographs that were cropped or zoomed may keep their EXIF, and share a camera with the others. The
+best reconstruction is tried for this: where views fit better with a camera of their own
+(`xrgs.mixture.own_cameras`), the attempt `cameras_apart` gives them one.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+from xrgs.mixture import sfm
+from xrgs.photos.masks import copy_mask
+from xrgs.runtime.text import listed
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from xrgs.config import SfmConf
+    from xrgs.mixture.photographs import PhotoCollection
+
+_log = logging.getLogger(__name__)
+
+#: The fewest inliers that COLMAP itself accepts for an absolute pose.
+_MIN_INLIERS = 6
+#: The diagonal of 35 mm film, mm: CIPA defines equal focal lengths by it.
+_FILM_DIAGONAL = math.hypot(36, 24)
+#: The report's values that are kept for each attempt.
+_ATTEMPT_KEYS = (
+    "lr_images",
+    "first_octave",
+    "max_num_features",
+    "init_min_tri_angle",
+    "min_inliers",
+    "registered",
+    "models",
+    "points",
+    "reprojection_error_px",
+)
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """One way to run SfM."""
+
+    name: str
+    conf: SfmConf
+    uses_exif: bool = True
+    """Whether refinement begins with the focal lengths that EXIF gives."""
+    apart: Mapping[int, int] = field(default_factory=dict)
+    """The views that don't share the camera of their name; those of one number share one."""
+
+
+def relaxed(conf: SfmConf, images: int, *, any_smaller: bool) -> Attempt:  # noqa: ARG001
+    """Accept half of the inliers per view; features and matches stay, so that it is quick."""
+    return Attempt("relaxed", replace(conf, min_inliers=max(_MIN_INLIERS, conf.min_inliers // 2)))
+
+
+def finer(conf: SfmConf, images: int, *, any_smaller: bool) -> Attempt:  # noqa: ARG001
+    """Detect twice the features, at twice the resolution."""
+    features = 2 * sfm.features_per_image(images, conf.max_num_features)
+    return Attempt("finer", replace(conf, max_num_features=features, first_octave=-1))
+
+
+def narrower(conf: SfmConf, images: int, *, any_smaller: bool) -> Attempt:  # noqa: ARG001
+    """Accept a quarter of the first pair's angle."""
+    return Attempt("narrower", replace(conf, init_min_tri_angle=conf.init_min_tri_angle / 4))
+
+
+def other_size(conf: SfmConf, images: int, *, any_smaller: bool) -> Attempt | None:  # noqa: ARG001
+    """Give the LR images the other way: `native` instead of `upsampled`, or the reverse."""
+    other = "native" if conf.lr_images == "upsampled" else "upsampled"
+    return Attempt(other, replace(conf, lr_images=other)) if any_smaller else None
+
+
+#: The attempts after the first, in order. Each changes the settings of the attempt before it, and
+#: gets the number of images and whether any of them is smaller than the largest; None skips it.
+#: ALIKED and LightGlue are none of them: pycolmap's wheels are built without ONNX, and abort the
+#: process where these are asked for.
+FALLBACKS = (relaxed, finer, narrower, other_size)
+
+
+@dataclass(frozen=True)
+class Registration:
+    """The reconstruction that was chosen, and a report of every attempt."""
+
+    model: sfm.Reconstruction
+    refused: str
+    """Why even the best reconstruction is not accepted; empty where it is."""
+    attempt: Attempt
+    """How it was made."""
+    attempts: list[dict[str, Any]]
+    """For each attempt its name, why it was refused, its seconds, settings and results."""
+
+
+def register(
+    photos: PhotoCollection,
+    degraded: Collection[int],
+    conf: SfmConf,
+    work: Path,
+    refusal: Callable[[sfm.Reconstruction], str],
+) -> Registration:
+    """Run SfM on the mixed-resolution images, until a reconstruction is accepted.
+
+    Args:
+        photos: The photographs, with their `sfm` copies, and `sfm_lr` copies of the degraded ones.
+        degraded: Indices of the views that SfM gets degraded.
+        conf: The settings of the first attempt.
+        work: An existing folder for SfM's own files.
+        refusal: Returns why a reconstruction is refused; an empty text accepts it.
+
+    Returns:
+        The reconstruction with the most registered views of those that were accepted, or of all
+        where none was; the earlier one of two with equally many.
+    """
+    best: tuple[sfm.Reconstruction, str, Attempt] | None = None
+    reports: list[dict[str, Any]] = []
+    folders: dict[tuple[object, ...], Path] = {}
+
+    def run(attempt: Attempt) -> tuple[sfm.Reconstruction, str, Attempt]:
+        start = time.perf_counter()
+        # Attempts with the same features and matches share a folder, where COLMAP finds them.
+        folder = folders.setdefault(_features_of(attempt), work / f"sfm-{attempt.name}")
+        model = _reconstruct(photos, degraded, attempt, folder)
+        reason = refusal(model)
+        seconds = round(time.perf_counter() - start, 1)
+        results = {key: model.report[key] for key in _ATTEMPT_KEYS if key in model.report}
+        reports.append({"attempt": attempt.name, "refused": reason, "seconds": seconds} | results)
+        if reason:
+            _log.warning("SfM attempt %s: %s", attempt.name, reason)
+        return model, reason, attempt
+
+    for attempt in _attempts(photos, degraded, conf):
+        found = run(attempt)
+        if best is None or _rank(*found[:2]) > _rank(*best[:2]):
+            best = found
+        if not best[1] and (len(best[0].viewmats) == len(photos) or len(reports) > 1):
+            break
+    if best is None:
+        raise RuntimeError("there is always a first attempt")
+    if best[0].apart and conf.camera == "auto":
+        found = run(replace(best[2], name="cameras_apart", apart=best[0].apart))
+        if (*_rank(*found[:2]), -_error(found[0])) > (*_rank(*best[:2]), -_error(best[0])):
+            best = found
+    model, reason, attempt = best
+    notes = [*model.report.get("notes", ()), *_notes(attempt, photos)]
+    model = replace(model, report=model.report | {"notes": notes})
+    return Registration(model, reason, attempt, reports)
+
+
+def _error(model: sfm.Reconstruction) -> float:
+    return float(model.report.get("reprojection_error_px", math.inf))
+
+
+def _notes(attempt: Attempt, photos: PhotoCollection) -> Iterator[str]:
+    """Say what an attempt did otherwise than EXIF says."""
+    if not attempt.uses_exif:
+        focals = sorted({photo.focal_35mm for photo in photos.all if photo.focal_35mm})
+        shown = ", ".join(f"{focal:g}" for focal in focals)
+        yield (
+            f"the focal length in EXIF ({shown} mm of 35 mm film) was not used, since SfM failed"
+            " with it: it may be wrong"
+        )
+    if attempt.apart:
+        names = listed([photos.names[i] for i in sorted(attempt.apart)])
+        yield (
+            f"cropped or zoomed, though EXIF does not say so: {names} fit with another focal length"
+            " than the others of their camera, and have a camera of their own"
+        )
+
+
+def _attempts(
+    photos: PhotoCollection, degraded: Collection[int], conf: SfmConf
+) -> Iterator[Attempt]:
+    any_smaller = any(
+        photos.size(_kind(i, degraded), i) != photo.sfm for i, photo in enumerate(photos.all)
+    )
+    any_focal = any(photo.focal_35mm and photo.K is None for photo in photos.all)
+    yield from sfm_attempts(conf, len(photos), any_smaller=any_smaller, any_focal=any_focal)
+
+
+def _rank(model: sfm.Reconstruction, refused: str) -> tuple[bool, int]:
+    return not refused, len(model.viewmats)
+
+
+def sfm_attempts(
+    conf: SfmConf, images: int, *, any_smaller: bool, any_focal: bool = False
+) -> Iterator[Attempt]:
+    """Yield the attempts to run SfM, in order.
+
+    Args:
+        conf: The settings of the first attempt; `fallbacks` says whether there are others.
+        images: The number of images.
+        any_smaller: Whether any image is smaller than its HR view.
+        any_focal: Whether EXIF gives the focal length of any image.
+    """
+    attempt = Attempt("configured", conf)
+    yield attempt
+    for fallback in FALLBACKS if conf.fallbacks else ():
+        following = fallback(attempt.conf, images, any_smaller=any_smaller)
+        if following is not None:
+            attempt = following
+            yield attempt
+        if fallback is FALLBACKS[0] and any_focal:
+            yield Attempt("without_exif", conf, uses_exif=False)
+
+
+def _features_of(attempt: Attempt) -> tuple[object, ...]:
+    """Return what decides features, matches and the cameras that they begin with."""
+    conf = attempt.conf
+    settings = conf.lr_images, conf.max_num_features, conf.first_octave
+    return *settings, attempt.uses_exif, tuple(attempt.apart.items())
+
+
+def sfm_images(
+    photos: PhotoCollection, degraded: Collection[int], attempt: Attempt
+) -> list[sfm.SfmImage]:
+    """Return the image of each photograph for SfM, with the intrinsics that are known.
+
+    Args:
+        photos: The photographs, with their `sfm` copies, and `sfm_lr` copies of the degraded ones;
+            upsampled copies are made where they are needed.
+        degraded: Indices of the views that SfM gets degraded.
+        attempt: Its settings say how smaller images are given.
+    """
+    result = []
+    for i, photo in enumerate(photos.all):
+        kind = _kind(i, degraded)
+        if attempt.conf.lr_images == "upsampled":
+            kind = photos.upsampled(kind, i)
+        width, height = photos.size(kind, i)
+        lens = photo.lens and photo.lens.resized(width, height)
+        focal_35mm = photo.focal_35mm if attempt.uses_exif and i not in attempt.apart else None
+        focal = focal_35mm and focal_35mm * math.hypot(width, height) / _FILM_DIAGONAL
+        # Where the intrinsics are known, each image has a camera of its own, with its own K.
+        camera = photo.name if lens else f"{photo.camera} {width}x{height}"
+        if i in attempt.apart:
+            camera += f" {attempt.apart[i]}"
+        file, K = photos.file(kind, i), lens.K if lens else None
+        masked = copy_mask(photos.folder, file).exists()
+        result.append(sfm.SfmImage(file, photo.name, camera, K, focal, masked))
+    return result
+
+
+def _kind(index: int, degraded: Collection[int]) -> str:
+    return "sfm_lr" if index in degraded else "sfm"
+
+
+def _reconstruct(
+    photos: PhotoCollection, degraded: Collection[int], attempt: Attempt, work: Path
+) -> sfm.Reconstruction:
+    """Run SfM once; the cameras of the result are the HR views'."""
+    work.mkdir(exist_ok=True)
+    given = sfm_images(photos, degraded, attempt)
+    model = sfm.reconstruct(given, photos.folder, work, attempt.conf)
+    lenses = {i: photos[i].to_hr(lens) for i, lens in model.lenses.items()}
+    return replace(model, lenses=lenses)
+
+
+def reconstruct_undegraded(
+    photos: PhotoCollection, attempt: Attempt, work: Path
+) -> sfm.Reconstruction:
+    """Run SfM once on the undegraded photographs, as in an attempt."""
+    return _reconstruct(photos, (), attempt, work / "sfm-reference")

@@ -1,0 +1,18 @@
+"""Tags close-ups HR and distant views LR (the paper's Dining Room)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from xrgs.mixture.sampling_rate import Measures
+
+
+class Distance:
+    """The policy `distance`."""
+
+    needs_depth = True
+
+    def score(self, view: Measures) -> float:
+        """Return 1 / depth."""
+        return 1 / view.depth

@@ -1,0 +1,19 @@
+"""Tags views by the pixel counts of their photographs (the paper's Camera Keychain)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from xrgs.mixture.sampling_rate import Measures
+
+
+class Megapixels:
+    """The policy `megapixels`."""
+
+    needs_depth = False
+
+    def score(self, view: Measures) -> float:
+        """Return the pixel count of the photograph as it was taken."""
+        width, height = view.size
+        return float(width * height)

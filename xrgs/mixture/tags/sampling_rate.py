@@ -1,0 +1,20 @@
+"""Tags views by their sampling rate, which pixel count and distance both determine."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from xrgs.mixture.sampling_rate import sampling_rate
+
+if TYPE_CHECKING:
+    from xrgs.mixture.sampling_rate import Measures
+
+
+class SamplingRate:
+    """The policy `sampling_rate`."""
+
+    needs_depth = True
+
+    def score(self, view: Measures) -> float:
+        """Return the sampling rate of the undistorted HR view: focal length over depth."""
+        return sampling_rate(view.K, view.depth)

@@ -1,0 +1,1 @@
+"""Turns what people have into one plain folder: upright sRGB photographs, masks and lenses."""

@@ -1,0 +1,281 @@
+"""Finds the masks of photographs, and brings them to the sizes of the views.
+
+A mask is an image in which white is used and black is not, as in COLMAP. A pixel of a resized or
+undistorted view is used if nearly all pixels that it is made of are used.
+"""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from xrgs.errors import UnreadableError, XrgsError
+from xrgs.photos import images
+from xrgs.photos.lens import undistort
+from xrgs.runtime.text import listed
+from xrgs.safeio.files import walk_files
+from xrgs.safeio.paths import user_path
+
+if TYPE_CHECKING:
+    from xrgs.photos.images import Header
+    from xrgs.photos.lens import Lens
+
+Mask = NDArray[np.bool_]  # [H, W], True for a pixel that is used
+
+_T = TypeVar("_T", np.float32, np.uint8)
+#: The folder of the masks of copies.
+MASKS = "masks"
+#: What programs call masks, in names of files and folders.
+WORDS = r"masks?|segmentations?|seg|segments|mattes?|silhouettes?"
+#: What programs write before or after the name of the photograph.
+_AFFIX = re.compile(rf"^(?:{WORDS}|alpha)[\W_]|[\W_](?:{WORDS}|alpha)$", re.IGNORECASE)
+#: The brightness from which a pixel of a mask is white: half-way to black.
+_WHITE = 0.5
+#: The brightness of 1 in an 8-bit mask, in which programs that write labels have 0 and 1.
+_LABEL = 1 / 255
+#: A mask of which more than this share is neither black nor white may be another picture.
+_MOST_BETWEEN, _BLACK_BELOW = 0.05, 0.1
+_GREY = "masks that are not black and white, of which what is brighter than grey is used"
+#: A pixel is used if at least this share of what it is made of is used.
+_NEARLY_ALL = 0.99
+
+
+def find(folder: str, photographs: Mapping[str, Path]) -> tuple[dict[str, Path], tuple[str, ...]]:
+    """Find the masks of photographs in a folder and all folders below it.
+
+    The mask of `IMG_1.jpg` is `IMG_1` with the suffix of any image, `IMG_1.jpg.png`, or one of
+    these with `mask` before or after the name. Folders come before the name as in the names of
+    photographs. Small and capital letters are the same.
+
+    Args:
+        folder: `scene.masks`.
+        photographs: The photographs by name. They may lie in the folder, and are no masks.
+
+    Returns:
+        The masks by the names of the photographs, and sentences on photographs without a mask and
+        on masks without a photograph.
+
+    Raises:
+        UnreadableError: The folder can't be read now.
+        XrgsError: The folder is missing, none of its images is the mask of a photograph, or two are
+            masks of one.
+    """
+    root = user_path(folder)
+    wanted = {_key(name): name for name in photographs}
+    own = {file.resolve() for file in photographs.values()}
+    found: dict[str, Path] = {}
+    others = []
+    for inside in _images_below(root):
+        if (root / inside).resolve() in own:
+            continue
+        name = next((wanted[key] for key in _keys(inside) if key in wanted), None)
+        if name is None:
+            others.append(str(inside))
+        elif name in found:
+            pair = f"{found[name].relative_to(root)} and {inside}"
+            raise XrgsError(f"scene.masks={root}: {pair} are both masks of {name}; remove one")
+        else:
+            found[name] = root / inside
+    if not found:
+        there = f"only {listed(others)}" if others else "no image"
+        first = min(wanted.values())
+        raise XrgsError(
+            f"scene.masks={root}: no mask of a photograph in it, {there}; the mask of {first} is"
+            f" {first}.png"
+        )
+    notes = []
+    if missing := [name for name in wanted.values() if name not in found]:
+        notes.append(f"no mask in scene.masks, so that all pixels are used: {listed(missing)}")
+    if others:
+        notes.append(f"masks of no photograph in scene.masks: {listed(others)}")
+    return dict(sorted(found.items())), tuple(notes)
+
+
+def _images_below(root: Path) -> list[Path]:
+    """Return the images below a folder by their paths in it, sorted, without hidden ones."""
+    if not root.is_dir():
+        raise XrgsError(f"scene.masks={root}: no such folder")
+    try:
+        inside = [Path(name) for name, _ in walk_files(root)]
+    except OSError as error:
+        raise UnreadableError(f"{error.filename}: {error.strerror}; try again") from error
+    return sorted(
+        path
+        for path in inside
+        if path.suffix.lower() in images.SUFFIXES
+        and not any(part.startswith(".") for part in path.parts)
+    )
+
+
+def _keys(inside: Path) -> Iterator[str]:
+    """Yield the keys of the names of the photographs that a file may be the mask of."""
+    for stem in dict.fromkeys((inside.stem, _AFFIX.sub("", inside.stem))):
+        yield _key("_".join([*inside.parent.parts, stem]))
+        if Path(stem).suffix.lower() in images.SUFFIXES:
+            yield _key("_".join([*inside.parent.parts, Path(stem).stem]))
+
+
+def _key(name: str) -> str:
+    return unicodedata.normalize("NFC", name).casefold()
+
+
+@dataclass(frozen=True)
+class Masks:
+    """The masks of photographs, and how each of them lies on its photograph."""
+
+    files: Mapping[str, Path]
+    """The masks by the names of the photographs."""
+    turned: frozenset[str]
+    """The photographs whose masks are of the stored pixels, and are turned by EXIF as these are."""
+    notes: tuple[str, ...]
+    """A sentence on masks that fit both ways."""
+
+    @classmethod
+    def fitted(cls, files: Mapping[str, Path], headers: Mapping[str, Header]) -> Masks:
+        """Decide whether masks were made of the photographs as stored, or as they are seen.
+
+        A mask that has the shape of one alone decides for itself, and for the masks of the same
+        folder that fit both ways: of photographs that EXIF turns by 180 degrees, or square ones.
+
+        Args:
+            files: The masks by the names of the photographs; others than in `headers` are left out.
+            headers: The headers of the photographs.
+
+        Raises:
+            UnreadableError: A mask can't be read now.
+            ImageError: A mask is no image.
+            XrgsError: A mask has another shape than its photograph.
+        """
+        files = {name: file for name, file in files.items() if name in headers}
+        stored, seen, either = set[str](), set[str](), set[str]()
+        for name, file in files.items():
+            photograph, mask = headers[name], images.header(file)
+            width, height = photograph.size
+            as_stored = images.turned_size(photograph.size, photograph.orientation)
+            fits_seen = _same_shape(mask.size, (width, height))
+            if not fits_seen and not _same_shape(mask.size, as_stored):
+                raise XrgsError(
+                    f"{file}: a mask of {mask.size[0]} x {mask.size[1]} px is of another picture"
+                    f" than {name}, which has {width} x {height} px"
+                )
+            if photograph.orientation == 1:
+                continue
+            if not fits_seen:
+                stored.add(name)
+            elif mask.orientation > 1 or not _same_shape(mask.size, as_stored):
+                seen.add(name)  # a mask with a tag of its own has been turned by it
+            else:
+                either.add(name)
+        notes = []
+        if stored and not seen:
+            stored |= either
+        elif either and bool(stored) == bool(seen):
+            notes.append(
+                "masks that fit a photograph both as stored and as turned by EXIF are taken as"
+                f" turned: {listed(sorted(either))}"
+            )
+        return cls(files, frozenset(stored), tuple(notes))
+
+    def read(self, name: str, photograph: Header) -> tuple[Mask | None, str]:
+        """Read the mask of a photograph.
+
+        Returns:
+            The mask at the photograph's size, None where it has none, and what is to be said of it:
+            empty for a black and white one.
+
+        Raises:
+            UnreadableError: The mask can't be read now.
+            ImageError: The mask can't be decoded.
+        """
+        if name not in self.files:
+            return None, ""
+        picture = images.decode(self.files[name])
+        bright = picture.pixels.max(axis=-1)  # a colour is as white as its brightest channel
+        if picture.alpha is not None:
+            bright *= picture.alpha
+        largest = float(bright.max())
+        mask: Mask = bright > 0 if largest < 1.5 * _LABEL else bright >= _WHITE
+        is_between = (bright > _BLACK_BELOW) & (bright < 1 - _BLACK_BELOW)
+        note = _GREY if largest >= 1.5 * _LABEL and is_between.mean() > _MOST_BETWEEN else ""
+        if name in self.turned:
+            mask = images.turned(mask, photograph.orientation)
+        nearest = [
+            ((np.arange(wanted) + 0.5) * given / wanted).astype(int)
+            for wanted, given in zip(photograph.size[::-1], mask.shape, strict=True)
+        ]
+        return mask[np.ix_(*nearest)], note
+
+
+def copy_mask(folder: Path, file: str) -> Path:
+    """Return the file of the mask of a copy in a folder, which is where COLMAP looks for it."""
+    return folder / MASKS / f"{file}.png"
+
+
+def _same_shape(one: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Return whether one size is the other at another scale, up to the rounding of a side."""
+    (w, h), (width, height) = one, other
+    return abs(h - height * w / width) < 1 or abs(w - width * h / height) < 1
+
+
+@overload
+def resized(mask: Mask, width: int, height: int) -> Mask: ...
+@overload
+def resized(mask: None, width: int, height: int) -> None: ...
+def resized(mask: Mask | None, width: int, height: int) -> Mask | None:
+    """Resize a mask: a pixel is used if nearly all pixels that it is made of are used."""
+    if mask is None or mask.shape == (height, width):
+        return mask
+    import torch
+    from torch.nn.functional import interpolate
+
+    batch = torch.from_numpy(np.ascontiguousarray(mask)).float()[None, None]
+    share = interpolate(batch, size=(height, width), mode="bilinear", antialias=True)
+    used: Mask = share[0, 0].numpy() >= _NEARLY_ALL
+    return used
+
+
+def degraded(mask: Mask | None, size: tuple[int, int], factor: int) -> Mask | None:
+    """Return the mask of an LR view of `size` (height, width), from the mask of its HR view.
+
+    A view that keeps its size may have been brought down by `factor` and up again.
+    """
+    if mask is None:
+        return None
+    height, width = size
+    small = resized(mask, mask.shape[1] // factor, mask.shape[0] // factor)
+    return resized(small, width, height)
+
+
+def undistorted(mask: Mask, lens: Lens) -> Mask:
+    """Undistort a mask as `xrgs.photos.lens.undistort` does its image."""
+    share = undistort(mask[..., None].astype(np.float32), lens, order=1)
+    used: Mask = share[..., 0] >= _NEARLY_ALL
+    return used
+
+
+def filled(image: NDArray[_T], mask: Mask | None) -> NDArray[_T]:
+    """Give each pixel that is not used the colour of the nearest used one.
+
+    What is hidden then reaches no used pixel by resampling, and no window of SSIM.
+
+    Args:
+        image: [H, W, 3].
+        mask: [H, W]; None uses all pixels.
+
+    Returns:
+        [H, W, 3]; the image itself where all or none of its pixels are used.
+    """
+    if mask is None or not mask.any():
+        return image
+    from scipy.ndimage import distance_transform_edt
+
+    rows, columns = distance_transform_edt(~mask, return_distances=False, return_indices=True)
+    nearest: NDArray[_T] = image[rows, columns]
+    return nearest

@@ -1,0 +1,44 @@
+"""The kinds of scenes, and the digest of the code of each."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from xrgs.photos.scenes.folder import FolderScene
+from xrgs.photos.scenes.motorcycle import Motorcycle
+from xrgs.photos.scenes.procedural import ProceduralScene
+from xrgs.photos.scenes.video import VideoScene
+from xrgs.safeio.code import CodeFolders, code_digest
+from xrgs.safeio.refactorings import canonical
+
+if TYPE_CHECKING:
+    from xrgs.photos.scenes.scene import SceneKind
+
+_FOLDER = "photos/scenes"
+
+
+def code_of(kind: str) -> str:
+    """Return the digest of the code that provides the photographs of a kind of scenes.
+
+    It is every file of `photos/` but those of other kinds, and those that download photographs.
+    """
+    code = CodeFolders(
+        folders=("photos",),
+        whole_parts=("photos/download",),
+        folders_of_parts=(_FOLDER,),
+        parts=frozenset(f"{_FOLDER}/{name}.py" for name in KINDS),
+        registries=frozenset({f"{_FOLDER}/kinds.py"}),
+    )
+    files = (*code.core(), *code.part(f"{_FOLDER}/{kind}.py"))
+    return canonical("variant/scene", code_digest(*files))
+
+
+#: The kinds of scenes by `scene.kind`; each is in the module of its name.
+KINDS: dict[str, SceneKind] = {
+    "procedural": ProceduralScene(code_of),
+    "motorcycle": Motorcycle(),
+    "folder": FolderScene(),
+    "video": VideoScene(code_of),
+}
+#: Kinds that render or extract their photographs; what they hash has their code.
+MADE = ("procedural", "video")

@@ -1,0 +1,242 @@
+"""Takes the sharpest frames of a video, evenly spread, as the photographs of a scene.
+
+The frames are divided into as many parts as views are wanted, and the sharpest of each part is
+taken. Sharpness is the variance of the Laplacian of the brightness [pechpacheco2000], at a reduced
+size, where the noise of the sensor counts little. Frames are taken as a player shows them: with
+square pixels, upright, deinterlaced and in sRGB. HDR is refused, as in photographs. Nothing here
+imports av before frames are read.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import partial
+from importlib.util import find_spec
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from xrgs.errors import UnreadableError, XrgsError
+from xrgs.photos import colour, images
+from xrgs.photos.scenes import rendered
+from xrgs.photos.scenes.deinterlace import deinterlaced
+from xrgs.photos.scenes.panoramas import is_of_all_directions
+from xrgs.photos.scenes.scene import Scene, check_views, label
+from xrgs.runtime.progress import ProgressBar
+from xrgs.safeio.files import is_transient
+from xrgs.safeio.hashing import digest, file_digest
+from xrgs.safeio.paths import user_path
+from xrgs.safeio.sanitize import for_line
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+    from av.container import InputContainer
+    from av.video.frame import VideoFrame
+    from av.video.stream import VideoStream
+    from numpy.typing import NDArray
+
+    from xrgs.config import SceneConf
+
+_log = logging.getLogger(__name__)
+
+#: The longer side at which sharpness is measured, px; our choice.
+_SHARPNESS_SIDE = 640
+#: The containers that are read, by FFmpeg's names. Others, such as playlists, lead to other files.
+_CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg"
+#: H.273's number of a matrix that is not named, and the rows from which on players then take that
+#: of BT.709; for smaller frames they take that of BT.601.
+_UNKNOWN_MATRIX, _HD_ROWS = 2, 720
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """A decoded frame, and how a player shows it."""
+
+    decoded: VideoFrame
+    encoding: colour.Encoding | None
+    """The colours that the video names; None where they are sRGB's or not named."""
+    size: tuple[int, int]
+    """Width and height with square pixels, before it is turned, px."""
+
+
+@dataclass(frozen=True)
+class VideoScene:
+    """The sharpest frames of a video, which are extracted once."""
+
+    code: Callable[[str], str]
+    """The digest of the code of a kind of scenes."""
+
+    def names(self, conf: SceneConf, long_side: int) -> list[str]:  # noqa: ARG002
+        """Return the names of the frames: `frame_0000`, `frame_0001`, ..."""
+        check_views(conf)
+        return [f"frame_{index:04d}" for index in range(conf.views)]
+
+    def digest(self, conf: SceneConf, long_side: int) -> str:  # noqa: ARG002
+        """Hash the video's bytes, the number of frames and the source code.
+
+        Raises:
+            UnreadableError: The video can't be read now.
+            XrgsError: There is no such file, or the package that reads videos is not installed.
+        """
+        check_views(conf)
+        file = _file(conf.path)
+        try:
+            content = file_digest(file)
+        except OSError as error:
+            kind = UnreadableError if is_transient(error) else XrgsError
+            raise kind(f"scene.path={file}: {error.strerror}") from error
+        if find_spec("av") is None:
+            raise XrgsError(f"scene.path={file}: a video needs PyAV: pip install 'xrgs[video]'")
+        return digest([content, conf.views, self.code("video")])
+
+    def resolve(self, conf: SceneConf, long_side: int, home: Path) -> Scene:
+        """Extract the frames where they are not there."""
+        views, file = self.names(conf, long_side), _file(conf.path)
+        files = rendered.provide(home, views, lambda work: extract(file, views, work))
+        return Scene(label(conf), home.name, files, notes=_notes(file))
+
+
+def _notes(file: Path) -> tuple[str, ...]:
+    """Say which of several streams is read, as long as the video is there."""
+    import av
+
+    try:
+        with (
+            file.open("rb") as stream,
+            av.open(stream, "r", options={"format_whitelist": _CONTAINERS}) as container,
+        ):
+            count = len(_streams(container))
+    except (av.FFmpegError, OSError):
+        return ()
+    if count < 2:
+        return ()
+    return (f"the first of the {count} video streams of {file.name} is read, and no other",)
+
+
+def _streams(container: InputContainer) -> list[VideoStream]:
+    """Return the video streams of a file, without pictures of its cover."""
+    from av.stream import Disposition
+
+    cover = Disposition.attached_pic
+    return [one for one in container.streams.video if not one.disposition & cover]
+
+
+def _file(path: str | None) -> Path:
+    if not path:
+        raise XrgsError("scene.path is empty: give the video, scene.path=...")
+    return user_path(path)
+
+
+def extract(file: Path, names: Sequence[str], folder: Path) -> None:
+    """Write the sharpest frames of a video as `<name>.png` to a folder, as a player shows them.
+
+    Raises:
+        ImageError: The file is not a video, it is HDR or of 360 degrees, or its frames are too
+            large.
+        XrgsError: It has fewer frames than names.
+    """
+    with ProgressBar("sharpness of frames", "frame", None) as bar:
+        sharpness = []
+        for frame in _frames(file):
+            sharpness.append(measure_sharpness(_brightness(frame.decoded)))
+            bar.update(1)
+    if len(sharpness) < len(names):
+        raise XrgsError(
+            f"scene.views={len(names)}: {file} has {len(sharpness)} frames; lower scene.views"
+        )
+    chosen = dict(zip(sharpest(sharpness, len(names)), names, strict=True))
+    with ProgressBar("frames", "frame", len(names)) as bar:
+        for number, frame in enumerate(_frames(file)):
+            if number in chosen:
+                image = _shown(frame)
+                if is_of_all_directions(image.shape[1::-1], partial(images.small, image)):
+                    raise images.ImageError(
+                        f"{file}: its frames show all directions, 360 degrees, and no pinhole "
+                        "camera took them; cut them into perspective views first"
+                    )
+                images.save(folder / f"{chosen[number]}.png", image, durable=False)
+                bar.update(1)
+
+
+def sharpest(sharpness: list[float], parts: int) -> list[int]:
+    """Return the index of the largest value of each of some equal parts of a list.
+
+    The sizes of the parts differ by one at most. The first is taken where several are equal.
+    """
+    ends = [round(part * len(sharpness) / parts) for part in range(parts + 1)]
+    return [max(range(a, b), key=lambda i: sharpness[i]) for a, b in pairwise(ends)]
+
+
+def measure_sharpness(brightness: NDArray[np.uint8]) -> float:
+    """Return the variance of the Laplacian of a brightness [H, W] in 0..255."""
+    from scipy.ndimage import laplace
+
+    return float(laplace(brightness.astype(np.float32)).var())
+
+
+def _frames(file: Path) -> Iterator[_Frame]:
+    """Decode the frames of the first video stream.
+
+    What can't be decoded ends the video with a warning where frames came before it.
+    """
+    import av
+
+    number = 0
+    try:
+        with (
+            file.open("rb") as stream,
+            av.open(stream, "r", options={"format_whitelist": _CONTAINERS}) as container,
+        ):
+            if not (streams := _streams(container)):
+                raise images.ImageError(f"{file}: it has no video")
+            video = streams[0]
+            video.thread_type = "AUTO"
+            # Asked before frames are decoded: some decoders forget what the container says.
+            codec, aspect = video.codec_context, video.sample_aspect_ratio or Fraction(1)
+            encoding = colour.from_h273(codec.color_primaries, codec.color_trc)
+            for frame in deinterlaced(container.decode(video)):
+                width, height = _square(frame.width, frame.height, aspect)
+                if width * height > images.MAX_PIXELS:
+                    size = f"{width} x {height}"
+                    raise images.ImageError(f"{file}: its frames have {size} pixels, too many")
+                yield _Frame(frame, encoding, (width, height))
+                number += 1
+    except colour.ColourError as error:
+        raise images.ImageError(f"{file}: {error}") from error
+    except (av.FFmpegError, OSError) as error:
+        if number == 0:
+            raise images.ImageError(f"{file}: unreadable as a video ({error})") from error
+        _log.warning("%s", for_line(f"{file}: ends after frame {number} ({error})"))
+
+
+def _square(width: int, height: int, aspect: Fraction) -> tuple[int, int]:
+    """Return the size at which pixels of an aspect (width / height) are square: never smaller."""
+    if aspect > 1:
+        return round(width * aspect), height
+    return width, round(height / aspect)
+
+
+def _brightness(frame: VideoFrame) -> NDArray[np.uint8]:
+    """Return the brightness [H, W] of a frame, at the size at which sharpness is measured."""
+    scale = min(1.0, _SHARPNESS_SIDE / max(frame.width, frame.height))
+    small = frame.reformat(
+        max(1, round(frame.width * scale)), max(1, round(frame.height * scale)), format="gray"
+    )
+    return small.to_ndarray().astype(np.uint8)
+
+
+def _shown(frame: _Frame) -> images.ImageArray:
+    """Return a frame [H, W, 3] in 0..1: in sRGB, with square pixels, and turned."""
+    decoded = frame.decoded
+    is_hd = decoded.colorspace == _UNKNOWN_MATRIX and decoded.height >= _HD_ROWS
+    pixels = decoded.reformat(
+        format="rgb24", src_colorspace="ITU709" if is_hd else None
+    ).to_ndarray()
+    image, _ = colour.convert(pixels, None, frame.encoding)
+    turned = np.rot90(images.resize(image, *frame.size), round(decoded.rotation / 90) % 4)
+    return np.ascontiguousarray(turned)

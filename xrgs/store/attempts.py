@@ -1,0 +1,174 @@
+"""Plans and begins attempts at a cell, and removes cells: what changes the folder of a cell's name.
+
+A sweep first writes a cell's config and identity (`plan_cell`). Each attempt at the cell then gets
+a folder of its own, which takes the place of the one before. The process of an attempt works in
+that very folder, because the folder is its working directory, whatever folder gets the name
+afterwards. A kill between two attempts leaves folders `.<cell id>.old-*` and `.new-*`, which the
+next attempt settles.
+"""
+
+from __future__ import annotations
+
+import secrets
+import shutil
+from contextlib import suppress
+from dataclasses import asdict
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from xrgs.errors import UnreadableError
+from xrgs.safeio.atomic import write_json
+from xrgs.safeio.files import list_names, remove_path, sync_name, sync_tree
+from xrgs.store.cell_folder import CONFIG, IDENTITY, LOG, CellFolder
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from xrgs.config import Conf
+    from xrgs.store.schema import Identity
+
+
+def plan_cell(cell: CellFolder, conf: Conf, identity: Identity) -> None:
+    """Write the config and the identity of a cell that no process is training.
+
+    Files of an earlier attempt stay until the next one begins.
+
+    Raises:
+        OSError: The store can't be written.
+    """
+    cell.path.mkdir(exist_ok=True)
+    # Not durable: when the power goes, the sweep that has planned the cell is over.
+    write_json(cell.path / CONFIG, asdict(conf), durable=False)
+    write_json(cell.path / IDENTITY, msgspec.to_builtins(identity), durable=False)
+
+
+def begin_attempt(cell: CellFolder, is_owner: Callable[[], bool] = lambda: True) -> bool:
+    """Begin an attempt at a planned cell: put a new folder in the place of the cell's folder.
+
+    The new folder has the config and the identity of the old one, and the checkpoint and the log of
+    a stopped attempt. A folder that can't be resumed (failed without a checkpoint, or corrupt) is
+    renamed to `<cell id>.aside-<n>`, so that it can be inspected.
+
+    Args:
+        cell: The cell, whose lease the caller holds.
+        is_owner: Returns whether the lease is still held. It is asked right before the folder is
+            replaced.
+
+    Returns:
+        False where the lease was lost; nothing has changed then.
+
+    Raises:
+        UnreadableError: A file can't be read now.
+        OSError: The store can't be written.
+    """
+    folder = cell.path
+    stopped = _stopped(cell)
+    new, old = _hidden(folder, "new"), _hidden(folder, "old")
+    try:
+        new.mkdir()
+        _copy_if_there(folder / CONFIG, new)
+        _copy_if_there(folder / IDENTITY, new)
+        if stopped is not None:
+            _copy_if_there(stopped.checkpoint, new)
+            _copy_if_there(stopped.path / LOG, new)
+        (new / LOG).touch()  # from now on the cell has begun
+        sync_tree(new)
+        if not is_owner():
+            remove_path(new)
+            return False
+        folder.rename(old)
+        # Otherwise a power failure could keep the new folder's name and lose this one.
+        sync_name(old)
+        new.rename(folder)
+    except BaseException:
+        _remove(new)
+        raise
+    sync_name(folder)
+    _settle_leftovers(folder)
+    return True
+
+
+def remove_cell(cell: CellFolder) -> None:
+    """Remove a cell, whose lease the caller holds.
+
+    The cell loses its name first: what a kill leaves of it is no cell, and is removed with the next
+    attempt or by `xrgs-store gc`.
+
+    Raises:
+        OSError: The cell can't be removed.
+    """
+    gone = _hidden(cell.path, "new")
+    cell.path.rename(gone)
+    sync_name(gone)
+    remove_path(gone)
+
+
+def _stopped(cell: CellFolder) -> CellFolder | None:
+    """Return the attempt that a new one resumes: the last one, where it can be resumed.
+
+    A process that was killed while it began an attempt may have left the last one hidden.
+    """
+    begun = (cell.path / LOG).exists() or cell.status_file.exists()
+    last = [cell] if begun else _leftovers(cell.path, "old")
+    return next((attempt for attempt in last if _can_resume(attempt)), None)
+
+
+def _can_resume(attempt: CellFolder) -> bool:
+    state = attempt.state()
+    if state.name == "unknown":
+        raise UnreadableError(f"{attempt.path}: {state.reason}")
+    failed_late = state.name == "failed" and attempt.checkpoint.is_file()
+    return state.name in {"planned", "unfinished"} or failed_late
+
+
+def _hidden(folder: Path, kind: str) -> Path:
+    """Return a name that no folder has, for a folder that is made or replaced."""
+    return folder.with_name(f".{folder.name}.{kind}-{secrets.token_hex(4)}")
+
+
+def _leftovers(folder: Path, kind: str) -> list[CellFolder]:
+    """Return the hidden folders of one kind: attempts (`old`), or what nobody needs (`new`)."""
+    prefix = f".{folder.name}.{kind}-"
+    names = [name for name in list_names(folder.parent) if name.startswith(prefix)]
+    return [CellFolder(folder.with_name(name)) for name in names]
+
+
+def _settle_leftovers(folder: Path) -> None:
+    """Remove stopped attempts, which the new one resumes; keep every other one aside."""
+    for old in _leftovers(folder, "old"):
+        name = _hidden(folder, "new") if _can_resume(old) else _free_name(folder)
+        old.path.rename(name)
+        # What a power failure leaves of a removal must not pass for an attempt.
+        sync_name(name)
+    for new in _leftovers(folder, "new"):
+        _remove(new.path)
+
+
+def _copy_if_there(file: Path, folder: Path) -> None:
+    """Copy a file into a folder.
+
+    It is not moved: until the new attempt is in place the old one must be whole, and its process
+    may have the log open.
+    """
+    if file.is_file():
+        shutil.copyfile(file, folder / file.name)
+
+
+def _remove(folder: Path) -> None:
+    """Remove a folder that no process needs any more.
+
+    The folder of a process that has lost its lease, and still writes, may resist: the next attempt
+    tries again.
+    """
+    with suppress(OSError):
+        remove_path(folder)
+
+
+def _free_name(path: Path) -> Path:
+    """Return the first sibling that does not exist: `<name>.aside-1`, `<name>.aside-2`, ..."""
+    number = 1
+    while (free := path.with_name(f"{path.name}.aside-{number}")).exists():
+        number += 1
+    return free

@@ -1,0 +1,461 @@
+"""One cell's folder in a store: its files, its state, and its results.
+
+`config.json` and `identity.json` are there first. `status.json` is written last, by an atomic
+rename, and lists every result: a cell is done when that file says so and the listed files are
+present and unchanged.
+"""
+
+from __future__ import annotations
+
+import stat
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from xrgs.errors import StoreError, UnreadableError
+from xrgs.runtime import progress
+from xrgs.safeio.atomic import write_json, write_text
+from xrgs.safeio.files import is_name, is_transient, sync_tree, walk_files
+from xrgs.safeio.hashing import file_digest
+from xrgs.safeio.records import MAX_BYTES, as_number, read_struct, read_table
+from xrgs.safeio.sanitize import for_terminal
+from xrgs.store.schema import FileEntry, Identity, Provenance, Status, Summary
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+    import pandas as pd
+
+    from xrgs.config import Conf
+    from xrgs.mixture.views import Variant
+    from xrgs.splat.cameras import Camera
+    from xrgs.splat.gaussians import Gaussians
+    from xrgs.training.dataset import Dataset
+
+#: Reports are made from these files, so they are verified by their hash; others by their size.
+_VERIFIED_BY_HASH = frozenset(
+    {"config.json", "identity.json", "scores.csv", "summary.json", "history.csv", "quality.csv"}
+)
+CONFIG, IDENTITY, CHECKPOINT, LOG = "config.json", "identity.json", "checkpoint.npz", "log.txt"
+_NOT_RESULTS = frozenset({LOG, "status.json", "progress.json", CHECKPOINT, f"refused-{CHECKPOINT}"})
+
+
+@dataclass(frozen=True)
+class CellState:
+    """The state of a cell, and the reason for it."""
+
+    name: str
+    """`absent`, `planned` (a sweep has written its config), `unfinished`, `running`, `failed`,
+    `corrupt` or `done`; `unknown` where a file can't be read now: look again later."""
+    reason: str = ""
+
+    @classmethod
+    def of_error(cls, error: StoreError | OSError) -> CellState:
+        """Return the state of a cell whose files can't be read, or are damaged."""
+        if isinstance(error, UnreadableError):
+            return cls("unknown", f"it can't be read now: {error}")
+        if isinstance(error, OSError):
+            kind = "unknown" if is_transient(error) else "corrupt"
+            return cls(kind, f"{error.filename}: {error.strerror}")
+        return cls("corrupt", str(error))
+
+
+@dataclass(frozen=True)
+class CellFolder:
+    """The folder of one cell: its config, its results and its state."""
+
+    path: Path
+    name: str = ""
+    """The cell's id, where the folder's own name is another one."""
+
+    @property
+    def id(self) -> str:
+        """The cell's id: the digest of its identity."""
+        return self.name or self.path.name
+
+    @property
+    def checkpoint(self) -> Path:
+        """File of the training checkpoint; it exists while the cell is not done."""
+        return self.path / CHECKPOINT
+
+    @property
+    def progress(self) -> Path:
+        """File that says how far the cell is; a process that is killed leaves it behind."""
+        return self.path / "progress.json"
+
+    @property
+    def status_file(self) -> Path:
+        """File of the final state, written after all other files."""
+        return self.path / "status.json"
+
+    # State
+
+    def state(self, *, verify: bool = True) -> CellState:
+        """Return whether this cell's result is present and intact.
+
+        Args:
+            verify: Hash the files that reports are made from; otherwise only sizes are compared.
+        """
+        try:
+            try:
+                self.status_file.stat()  # `exists` hides errors that pass, from Python 3.14 on
+            except (FileNotFoundError, NotADirectoryError):
+                return self._state_without_status()
+            status = self.status()
+            if status.state == "failed":
+                return CellState("failed", status.reason)
+            self._check(status, verify=verify)
+        except (StoreError, OSError) as error:
+            return CellState.of_error(error)
+        return CellState("done")
+
+    def _state_without_status(self) -> CellState:
+        if not self.path.exists():
+            return CellState("absent")
+        if not self.path.is_dir():
+            return CellState("corrupt", "it is not a folder")
+        if self.checkpoint.exists():
+            resumes = "it was stopped before it ended; it resumes from its checkpoint"
+            return CellState("unfinished", resumes)
+        if not (self.path / LOG).exists():
+            return CellState("planned", "it has not begun")
+        return CellState("unfinished", "it was stopped before it ended")
+
+    def steps_to_resume(self) -> int:
+        """Return about how many steps the next attempt need not repeat: the checkpoint has them.
+
+        They are counted in the history, which is written as the training goes on; 0 where the cell
+        has no checkpoint or its history can't be read.
+        """
+        if not self.checkpoint.exists():
+            return 0
+        try:
+            header, rows = read_table(self.path / "history.csv")
+            return int(dict(zip(header, rows[-1], strict=True))["step"]) + 1
+        except (StoreError, LookupError, ValueError):
+            return 0
+
+    def running(self, owner: str) -> CellState:
+        """Return the state of a cell whose lease the described process holds."""
+        now = progress.read(self.progress)
+        return CellState("running", f"by {owner}" + (f": {now}" if now else ""))
+
+    def _check(self, status: Status, *, verify: bool) -> None:
+        """Raise `StoreError` where a file of a done cell is missing or has changed."""
+        for name, entry in status.files.items():
+            file = self.path / name
+            try:
+                size = file.stat().st_size
+            except (FileNotFoundError, NotADirectoryError):
+                size = -1
+            if size != entry.bytes:
+                raise StoreError(f"{name} is missing or has another size")
+            is_read = name in _VERIFIED_BY_HASH
+            if is_read and size > MAX_BYTES:
+                raise StoreError(f"{name} has {size} bytes, at most {MAX_BYTES} are read")
+            if is_read and verify and file_digest(file) != entry.sha256:
+                raise StoreError(f"{name} has changed since the cell finished")
+        if verify and tuple(view for view, _ in self.view_scores()) != status.views:
+            raise StoreError("scores.csv does not have one row for each view that was to be scored")
+
+    def verify(self) -> list[str]:
+        """Hash every file of a finished cell, and decode its JSON.
+
+        Returns:
+            A line for each file that is missing, damaged, has changed, can't be read now or does
+            not belong there; empty for an intact cell.
+        """
+        try:
+            status = self.status()
+            wrong = [line for name, of in status.files.items() if (line := self._wrong(name, of))]
+            listed = status.files.keys() | status.trimmed.keys() | _NOT_RESULTS
+            wrong += [
+                f"{self.path}/{name}: it does not belong there"
+                for name, _ in walk_files(self.path)
+                if name not in listed
+            ]
+            if not wrong:
+                self._decode(status)
+        except (StoreError, OSError) as error:
+            reason = CellState.of_error(error).reason.replace(f"{self.path}/", "")
+            return [f"{self.path}: {reason}"]
+        return wrong
+
+    def _decode(self, status: Status) -> None:
+        """Raise `StoreError` where a JSON file of a done cell is not of its type."""
+        structs: dict[str, type[msgspec.Struct]] = {
+            IDENTITY: Identity,
+            "summary.json": Summary,
+            "provenance.json": Provenance,
+        }
+        for name in structs.keys() & status.files.keys():
+            read_struct(self.path / name, structs[name])
+
+    def _wrong(self, name: str, entry: FileEntry) -> str:
+        """Return what is wrong with one of the cell's files; empty where nothing is."""
+        try:
+            intact = file_digest(self.path / name) == entry.sha256
+        except OSError as error:
+            again = "; try again" if is_transient(error) else ""
+            return f"{self.path}/{name}: {error.strerror}{again}"
+        return "" if intact else f"{self.path}/{name}: it has changed since the cell finished"
+
+    # Ending a cell
+
+    def finish(self, views: Sequence[str], scored_by: Mapping[str, str]) -> None:
+        """Declare the cell done, with the files that are in the folder now.
+
+        All of them are on the disk before the cell says that it is done.
+
+        Args:
+            views: Names of the scored views, in the order of `scores.csv`.
+            scored_by: Digests of the code that scored, see `xrgs.store.scoring`.
+        """
+        sync_tree(self.path)
+        files = {
+            name: FileEntry(status.st_size, file_digest(self.path / name))
+            for name, status in sorted(walk_files(self.path))
+            if name not in _NOT_RESULTS
+        }
+        self._write_status(
+            Status("done", views=tuple(views), files=files, scored_by=dict(scored_by))
+        )
+        self.drop_checkpoint()  # after the status: a cell that is killed before needs it
+
+    def rescored(self, names: Sequence[str], scored_by: Mapping[str, str]) -> None:
+        """Keep new scores of a done cell: the caller has written them and holds the lease.
+
+        Args:
+            names: Files that were written anew.
+            scored_by: Digests of the code that scored.
+        """
+        status = self.status()
+        new = {
+            name: FileEntry((self.path / name).stat().st_size, file_digest(self.path / name))
+            for name in names
+        }
+        files = status.files | new
+        self._write_status(msgspec.structs.replace(status, files=files, scored_by=dict(scored_by)))
+
+    def fail(self, reason: str) -> None:
+        """Declare the cell failed, and write `error.txt` if its process did not."""
+        error = self.path / "error.txt"
+        if not error.exists():
+            write_text(error, for_terminal(f"{reason}\n"))
+        self.progress.unlink(missing_ok=True)
+        self._write_status(Status("failed", reason))
+
+    def drop_checkpoint(self) -> None:
+        """Remove the checkpoint, which a finished cell no longer needs."""
+        self.checkpoint.unlink(missing_ok=True)
+
+    def _write_status(self, status: Status) -> None:
+        write_json(self.status_file, msgspec.to_builtins(status))
+
+    # Trimming
+
+    def trimmed_status(self) -> Status:
+        """Return the status that a done cell has once it is trimmed.
+
+        Raises:
+            StoreError: The status can't be read, or the cell is not done.
+        """
+        status = self.status()
+        if status.state != "done":
+            raise StoreError(f"{self.status_file}: the cell is not done")
+        heavy = {name: entry for name, entry in status.files.items() if _is_heavy(name)}
+        kept = {name: entry for name, entry in status.files.items() if name not in heavy}
+        return msgspec.structs.replace(status, files=kept, trimmed=status.trimmed | heavy)
+
+    def trim(self) -> None:
+        """Remove the Gaussians and the renders of a done cell, and list them in its status.
+
+        The caller holds the cell's lease. The status is written first: a cell that is killed in
+        between is done, and the next call removes the rest.
+
+        Raises:
+            StoreError: The status can't be read, or the cell is not done.
+            OSError: A file can't be removed.
+        """
+        status = self.trimmed_status()
+        self._write_status(status)
+        for name in status.trimmed:
+            (self.path / name).unlink(missing_ok=True)
+        renders = self.path / "renders"
+        if renders.is_dir() and not any(renders.iterdir()):
+            renders.rmdir()
+
+    def is_trimmed(self) -> bool:
+        """Return whether files of the cell were removed by `xrgs-store trim`."""
+        try:
+            return bool(self.status().trimmed)
+        except StoreError:
+            return False
+
+    def check_not_trimmed(self, name: str) -> None:
+        """Refuse a file that was removed on purpose; the message says how to make it again.
+
+        Raises:
+            StoreError: The file was removed.
+        """
+        if self.status_file.exists() and name in self.status().trimmed:
+            raise StoreError(
+                f"cells/{self.id}/{name} was removed by xrgs-store trim; xrgs-sweep rerun= trains"
+                " the cell again, in a folder of its own"
+            )
+
+    def heavy_bytes(self) -> int:
+        """Return the bytes of the Gaussians and the renders, which `trim` would free."""
+        return sum(
+            status.st_size
+            for name, status in walk_files(self.path)
+            if stat.S_ISREG(status.st_mode) and _is_heavy(name)
+        )
+
+    # Files
+
+    def status(self) -> Status:
+        """Read `status.json`; raises StoreError where it is missing or damaged."""
+        return read_struct(self.status_file, Status)
+
+    def identity(self) -> Identity:
+        """Read `identity.json`; raises StoreError where it is missing or damaged."""
+        return read_struct(self.path / IDENTITY, Identity)
+
+    def summary(self) -> Summary:
+        """Read `summary.json`; raises StoreError where it is missing or damaged."""
+        return read_struct(self.path / "summary.json", Summary)
+
+    def provenance(self) -> Provenance:
+        """Read `provenance.json`; raises StoreError where it is missing or damaged."""
+        return read_struct(self.path / "provenance.json", Provenance)
+
+    def config(self) -> Conf:
+        """Return the config that the cell was trained with.
+
+        Keys that were added since have their values in the baseline.
+
+        Raises:
+            XrgsError: `config.json` can't be read, or is of another version's schema.
+        """
+        from xrgs.composing import from_file
+
+        return from_file(self.path / CONFIG)[0]
+
+    def view_scores(self) -> list[tuple[str, dict[str, float]]]:
+        """Return the name and the scores of every scored view, NaN where a score is missing.
+
+        Raises:
+            StoreError: `scores.csv` is missing or damaged.
+        """
+        file = self.path / "scores.csv"
+        header, rows = read_table(file)
+        views = [row[0] for row in rows]
+        if header[:1] != ["view"] or not all(map(is_name, views)):
+            raise StoreError(f"damaged: {file}: the first column must hold names of views")
+        if len(set(views)) < len(views):
+            raise StoreError(f"damaged: {file}: a view has two rows")
+        try:
+            values = [map(as_number, row[1:]) for row in rows]
+            scores = [dict(zip(header[1:], row, strict=True)) for row in values]
+        except ValueError as error:
+            raise StoreError(f"damaged: {file}: {error}") from error
+        return list(zip(views, scores, strict=True))
+
+    def scores(self) -> pd.DataFrame:
+        """Return the scores of the scored views.
+
+        Returns:
+            One row a view, indexed by its name (`view`), one column a score (`psnr` in dB, `ssim`,
+            `lpips`); NaN where a score was not computed.
+
+        Raises:
+            StoreError: `scores.csv` is missing or damaged.
+        """
+        import pandas as pd
+
+        scores = self.view_scores()
+        index = pd.Index([name for name, _ in scores], name="view", dtype=object)
+        return pd.DataFrame([values for _, values in scores], index=index)
+
+    def history(self) -> pd.DataFrame:
+        """Return the training history, one row per logged step; `view` is text, all else numbers.
+
+        Raises:
+            StoreError: `history.csv` is missing or damaged.
+        """
+        import pandas as pd
+
+        file = self.path / "history.csv"
+        header, rows = read_table(file)
+        table = pd.DataFrame(rows, columns=header, dtype=object)
+        try:
+            for name in header:
+                if name != "view":
+                    numbers = table[name].map(as_number).astype(float)
+                    whole = numbers.map(float.is_integer).all()
+                    table[name] = numbers.astype(int) if whole else numbers
+        except ValueError as error:
+            raise StoreError(f"damaged: {file}: {name}: {error}") from error
+        return table
+
+    def gaussians(self) -> Gaussians:
+        """Load the trained Gaussians, in the world of `cameras`.
+
+        Raises:
+            XrgsError: `splats.ply` is missing or damaged, or was removed on purpose.
+        """
+        from xrgs.formats.ply import read_ply
+
+        self.check_not_trimmed("splats.ply")
+        return read_ply(self.path / "splats.ply").gaussians
+
+    def variant(self) -> Variant:
+        """Load the variant that the cell was trained on, from the store that the cell is in.
+
+        Raises:
+            XrgsError: `identity.json` can't be read, or the variant is not in the store or damaged.
+        """
+        from xrgs.mixture import variant
+        from xrgs.store.trimming import check_images
+
+        variants, variant_id = self.path.parents[1] / "variants", self.identity().variant
+        check_images(variants, variant_id)
+        return variant.load(variants / variant_id)
+
+    def dataset(self) -> Dataset:
+        """Load what the cell was trained and scored on: photographs, cameras, points.
+
+        With `train.validation`, `test` has the held-out training views that its scores are of.
+        The cameras and points are in the normalised world of the Gaussians.
+
+        Raises:
+            XrgsError: As `config` and `variant`.
+        """
+        from xrgs.training import dataset
+
+        conf = self.config()
+        validation = conf.train.validation
+        return dataset.load(self.variant(), conf.train.views, validation=validation, seed=conf.seed)
+
+    def cameras(self) -> dict[str, dict[str, Camera]]:
+        """Load the cameras of the cell's views, in the normalised world of its Gaussians.
+
+        Returns:
+            `{"train": {name: camera}, "test": {name: camera}}`, in the variant's order.
+
+        Raises:
+            XrgsError: As `dataset`, which reads the photographs too.
+        """
+        data = self.dataset()
+        splits = {"train": data.train, "test": data.test}
+        return {
+            split: {view.name: view.camera for view in views} for split, views in splits.items()
+        }
+
+
+def _is_heavy(name: str) -> bool:
+    """Return whether only pictures, viewers and `rerun=` need a file of a done cell."""
+    return name == "splats.ply" or name.startswith("renders/")

@@ -1,0 +1,282 @@
+"""Says how a variant was made: notes for sweeps and reports, and all for `xrgs-data inspect`.
+
+Nothing here imports torch.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from msgspec import Struct, structs
+
+from xrgs.errors import XrgsError
+from xrgs.mixture import variant
+from xrgs.mixture.paths import is_failed
+from xrgs.mixture.saved_variant import REPORT, Manifest, read_manifest
+from xrgs.photos import images
+from xrgs.runtime.text import TextTable, listed, to_text
+from xrgs.safeio.atomic import atomic_writer
+from xrgs.safeio.records import read_struct
+from xrgs.safeio.sanitize import for_line
+from xrgs.store.contact_sheet import contact_sheet
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    from xrgs.mixture.saved_variant import ViewEntry
+    from xrgs.mixture.views import Variant, View
+
+
+#: Views have one camera where the angle between them, in degrees, and the distance, as a share of
+#: the cameras' extent, are at most these. Of two sets of copies SfM placed all within 0.06 degrees
+#: and 0.9 %. In the scenes of the studies no other pair is within four times both limits.
+_SAME_ANGLE, _SAME_PLACE = 0.1, 0.01
+#: The least share of coarse training views in a mixture. Our choice: `plus` gains 0.81 dB with a
+#: share of 0.45 (monstree), and no PSNR with 0.11 (reichstag).
+_MIXTURE_FROM = 0.25
+#: The recipe (a file of `conf/ablation/`) for a mixture, and the one for photographs alike.
+MIXTURE_RECIPE, ALIKE_RECIPE = "plus", "tuned_baseline"
+
+
+class SfmAttempt(Struct):
+    """One attempt of SfM at a scene's views."""
+
+    attempt: str
+    """The name of the recipe."""
+    refused: str = ""
+    """Why its result was not taken; empty where it was."""
+    registered: int = 0
+
+
+class SfmReport(Struct):
+    """The part of `report.json` that is shown: notes, how SfM went, the classes of the views."""
+
+    scene: str = "?"
+    reason: str = ""
+    """Why the scene failed; empty where it did not."""
+    images: int = 0
+    registered: int = 0
+    points: int = 0
+    reprojection_error_px: float | None = None
+    poses: str | None = None
+    """The digest of poses that were given; None where SfM has estimated them."""
+    lr_images: str | None = None
+    max_num_features: int | None = None
+    attempts: tuple[SfmAttempt, ...] = ()
+    tags: str | None = None
+    degradation: str | None = None
+    notes: tuple[str, ...] = ()
+    """Sentences on what was taken, left out, turned, converted or masked, by photographs' names."""
+    pose_error: dict[str, float] = {}
+    """`position_percent` of the extent, `rotation_degrees`, and `..._max` of each."""
+    pose_error_against: str = ""
+    rho: dict[str, tuple[float, ...]] = {}
+    """Least, median and most of the sampling rate, by tag."""
+    lr_blur: float | None = None
+    """The estimated blur of LR training views, LR px; None where it is not known."""
+    tests: int = 0
+    """Number of views that are held out; 0 where the training views are scored."""
+    hr: tuple[str, ...] = ()
+    lr: tuple[str, ...] = ()
+    not_registered: tuple[str, ...] = ()
+
+    @property
+    def not_trained(self) -> tuple[str, ...]:
+        """Names of the training views that are not placed."""
+        training = {*self.hr, *self.lr}
+        return tuple(name for name in self.not_registered if name in training)
+
+    @property
+    def not_scored(self) -> tuple[str, ...]:
+        """Names of the views that would be scored and are not placed."""
+        training = {*self.hr, *self.lr} if self.tests else ()
+        return tuple(name for name in self.not_registered if name not in training)
+
+    def all_notes(self, most: int = 6) -> tuple[str, ...]:
+        """Return the notes, and sentences on the views that are not placed.
+
+        Args:
+            most: The most names in such a sentence.
+        """
+        if not (self.hr or self.lr):  # of a scene that failed: the reason names the views
+            return self.notes
+        lost = (("trained on", self.not_trained), ("scored", self.not_scored))
+        unplaced = [
+            f"not placed, and so not {done}: {listed(names, most)}" for done, names in lost if names
+        ]
+        return (*self.notes, *unplaced)
+
+
+def read_report(folder: Path) -> SfmReport:
+    """Read how a variant was made, from its folder; it may be trimmed, or of a scene that failed.
+
+    Raises:
+        StoreError: The report or the list of views is missing or damaged, or can't be read now.
+    """
+    report = read_struct(folder / REPORT, SfmReport)
+    if is_failed(folder.name):
+        return report
+    return structs.replace(report, notes=(*report.notes, *shared_cameras(read_manifest(folder))))
+
+
+def shared_cameras(manifest: Manifest) -> list[str]:
+    """Say which views have one camera: they are copies of one photograph, or nearly.
+
+    Copies whose names are not related are found by nothing else.
+    """
+    splits = {"train", "test"} if manifest.held_out else {"train"}
+    views = [view for view in manifest.views if view.split in splits]
+    world_to_camera = np.array([view.viewmat for view in views])
+    rotations, shifts = world_to_camera[:, :3, :3], world_to_camera[:, :3, 3]
+    centres = -np.einsum("nji,nj->ni", rotations, shifts)
+    extent = np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()
+    distances = np.linalg.norm(centres[:, None] - centres, axis=2)
+    cosines = (np.einsum("nij,mij->nm", rotations, rotations) - 1) / 2
+    same = (distances <= _SAME_PLACE * extent) & (cosines >= np.cos(np.radians(_SAME_ANGLE)))
+    shared = [
+        " and ".join(f"{views[k].name} ({views[k].split})" for k in pair)
+        for pair in np.argwhere(np.triu(same, k=1))
+    ]
+    if not shared:
+        return []
+    return [f"views of one camera, as copies of a photograph are; remove one: {listed(shared)}"]
+
+
+def describe(folder: Path, out: Path | None = None) -> str:
+    """Describe a frozen variant and draw its contact sheet; for a failed one, say why it failed.
+
+    Args:
+        folder: The variant's folder in a store, or the `failed-...` folder of one that failed.
+        out: The PNG of the contact sheet; None writes `<variant id>.png` to the current folder.
+
+    Returns:
+        Tables and lines for a terminal. They name each image that can't be read.
+
+    Raises:
+        XrgsError: The folder is not a variant, or is damaged, or the sheet can't be written.
+    """
+    if not folder.is_dir():
+        raise XrgsError(f"{folder}: no such folder; variants are in <store>/variants/")
+    failed = is_failed(folder.name)
+    frozen = None if failed else variant.load(folder)
+    report = read_report(folder)
+    sfm = [for_line(line) for line in _sfm(report)]
+    if frozen is None:
+        why = report.reason or f"{report.scene}: failed"
+        return "\n".join([for_line(f"{why} So there are no views."), *sfm])
+    table = to_text(views_table(frozen, report))
+    sheet, notes = contact_sheet(frozen)
+    file = out or Path(f"{frozen.id}.png")
+    try:
+        with atomic_writer(file) as stream:
+            images.write_png(stream, sheet)
+    except OSError as error:
+        if out is None:
+            why = f"the sheet {file} can't be written here ({error.strerror}); give --out=FILE.png"
+            raise XrgsError(why) from error
+        raise XrgsError(f"out={file}: can't be written ({error})") from error
+    more = [f"Contact sheet: {file}", *(f"  {note}" for note in notes)]
+    return "\n".join([table, _mixture(frozen), *sfm, *map(for_line, more)])
+
+
+def views_table(frozen: Variant, report: SfmReport) -> TextTable:
+    """Return a table of the photographs that are trained on or held out, by name.
+
+    Photographs that SfM did not register are in the table too, by the names in the report.
+    """
+    rows = [
+        (v.name, v.split, v.tag, f"{v.width} x {v.height}", f"{v.sampling_rate:.3f}", "yes")
+        for v in frozen.views
+        if v.split != "original"
+    ]
+    for name in report.not_registered:
+        split = "train" if name in {*report.hr, *report.lr} else "test"
+        rows.append((name, split, "LR" if name in report.lr else "HR", "", "", "no"))
+    columns = ("View", "Split", "Tag", "Size, px", "rho", "Placed")
+    title = f"{frozen.scene}, variant {frozen.id}, factor {frozen.factor}"
+    return TextTable(title, columns, tuple(sorted(rows)), "lllrrl", tuple(_counts(frozen)))
+
+
+def _counts(frozen: Variant) -> Iterator[str]:
+    train = [view.tag for view in frozen.views if view.split == "train"]
+    tests = sum(view.split == "test" for view in frozen.views)
+    kind = "held out" if frozen.held_out else "tests, at the trained poses"
+    yield f"{train.count('HR')} HR and {train.count('LR')} LR to train on, {tests} {kind}"
+    if originals := sum(view.split == "original" for view in frozen.views):
+        yield f"originals of degraded views kept beside them: {originals}"
+
+
+class Mixture(NamedTuple):
+    """How many training views are coarse: they would need at least 1.5 times as many px a side."""
+
+    coarse: int
+    views: int
+
+    @property
+    def recipe(self) -> str:
+        """The recipe for such views."""
+        return MIXTURE_RECIPE if self.is_one else ALIKE_RECIPE
+
+    @property
+    def is_one(self) -> bool:
+        """Whether so many views are coarse that all are a mixture."""
+        return self.coarse >= _MIXTURE_FROM * self.views
+
+
+def mixture(views: Iterable[View | ViewEntry]) -> Mixture:
+    """Count the coarse training views among the views of a variant."""
+    needs = [view.supersampling for view in views if view.split == "train"]
+    # `supersampled`, and so the recipes, render a view larger by its need, rounded.
+    return Mixture(sum(round(need) > 1 for need in needs), len(needs))
+
+
+def _mixture(frozen: Variant) -> str:
+    """Say whether the training views are a mixture, and which recipe is for it."""
+    found = mixture(frozen.views)
+    recipes = f"+ablation={ALIKE_RECIPE} is for such views"
+    if found.is_one:
+        recipes = f"+ablation={MIXTURE_RECIPE} and +ablation=lean are for mixtures"
+    return (
+        f"{'a mixture' if found.is_one else 'hardly a mixture'}: {found.coarse} of {found.views}"
+        " training views would need at least 1.5 times as many px a side to show the scene as"
+        f" finely as the finest; {recipes}"
+    )
+
+
+def _sfm(report: SfmReport) -> Iterator[str]:
+    """Yield lines on how SfM went, as far as the report has them."""
+    error = report.reprojection_error_px
+    yield (
+        f"{'SfM' if report.poses is None else 'Poses given'}: {report.registered} of"
+        f" {report.images or '?'} views placed, {report.points} points"
+        + (f", {error:.2f} px" if error is not None else "")
+    )
+    if report.lr_images is not None:
+        yield f"  LR images {report.lr_images}, {report.max_num_features} features a view"
+    for attempt in report.attempts:
+        verdict = attempt.refused or f"accepted, {attempt.registered} placed"
+        yield f"  recipe {attempt.attempt}: {verdict}"
+    if report.tags is not None:
+        yield f"  tags by {report.tags}, degradation {report.degradation}"
+    yield from (f"  {note}" for note in report.notes)
+    if report.pose_error:
+        yield f"  poses against {report.pose_error_against}: " + "; ".join(_pose(report.pose_error))
+    for tag in ("HR", "LR"):
+        if rates := report.rho.get(tag):
+            numbers = ", ".join(f"{rate:.3f}" for rate in rates)
+            yield f"  rho of {tag}: {numbers} (least, median, most)"
+    if report.lr_blur is not None:
+        yield f"  blur of LR: {report.lr_blur:.2f} px, estimated (a pixel's area has 0.29)"
+    if report.not_registered:
+        yield f"  not placed: {', '.join(report.not_registered)}"
+
+
+def _pose(error: dict[str, float]) -> Iterator[str]:
+    for name, label, unit in (
+        ("position_percent", "position", "% of the extent"),
+        ("rotation_degrees", "rotation", "degrees"),
+    ):
+        if name in error:
+            yield f"{label} {error[name]:.3f} {unit}, at most {error[f'{name}_max']:.3f}"

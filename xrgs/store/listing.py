@@ -1,0 +1,301 @@
+"""The one table of a store: a typed row for each cell and each recorded sweep.
+
+`Store.cells`, `xrgs-status`, `xrgs-store` and `xrgs-report list` show views of these rows.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from dataclasses import dataclass
+from functools import cached_property
+from types import MappingProxyType
+from typing import TYPE_CHECKING
+
+from xrgs.errors import StoreError, XrgsError
+from xrgs.runtime.text import listed
+from xrgs.safeio.files import file_bytes
+from xrgs.splat.backend import arithmetic
+from xrgs.store.identity import changed_code
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+    from pathlib import Path
+
+    from xrgs.store.cell_folder import CellFolder, CellState
+    from xrgs.store.schema import Identity, RecordedCell, SweepRecord
+
+#: The states that a cell of a store can have.
+STATES = ("done", "running", "planned", "unfinished", "failed", "corrupt", "unknown")
+#: The most ids that a message lists.
+_MAX_LISTED = 6
+
+
+@dataclass(frozen=True, eq=False)
+class CellRow:
+    """One cell of a store."""
+
+    folder: CellFolder
+    state: CellState
+    recorded: RecordedCell | None
+    """The cell in the record of the latest sweep that has it."""
+    sweeps: tuple[str, ...]
+    """Ids of the sweeps that have the cell, oldest first."""
+    identity: Identity | None
+    """None where the file can't be read."""
+
+    @property
+    def id(self) -> str:
+        """The cell's id."""
+        return self.folder.id
+
+    @cached_property
+    def scene(self) -> str:
+        """The scene as the latest sweep names it; without a sweep, as the cell's config does."""
+        if self.recorded is not None:
+            return self.recorded.scene
+        try:
+            scene = self.folder.config().scene
+        except XrgsError:
+            return "?"
+        return scene.name or scene.path or scene.kind
+
+    @property
+    def label(self) -> str:
+        """The label in the latest sweep; `?` without a sweep."""
+        return self.recorded.label if self.recorded else "?"
+
+    @property
+    def arm(self) -> str:
+        """Label and condition."""
+        return f"{self.label} {self.recorded.condition if self.recorded else ''}".rstrip()
+
+    @property
+    def name(self) -> str:
+        """The cell's name for people."""
+        return f"{self.id}  {self.scene} / {self.arm}"
+
+    @property
+    def seed(self) -> int | None:
+        """The seed; None where the identity can't be read."""
+        return self.identity.seed if self.identity else None
+
+    @property
+    def variant_id(self) -> str | None:
+        """The id of the cell's variant; None where the identity can't be read."""
+        return self.identity.variant if self.identity else None
+
+    @cached_property
+    def stale(self) -> tuple[str, ...]:
+        """Parts of the program, and the arithmetic, that differ from the cell's identity.
+
+        A sweep trains a stale cell again, under another id.
+        """
+        if self.identity is None:
+            return ()
+        try:
+            changed = changed_code(self.identity, cached=True)
+            here = arithmetic(str(self.identity.splat["backend"]))
+        except XrgsError as error:  # the backend is not on this machine, which only reads stores
+            return (str(error),)
+        if self.identity.arithmetic != here:
+            changed.append(f"arithmetic ({self.identity.arithmetic}, here {here})")
+        return tuple(changed)
+
+    @cached_property
+    def age_s(self) -> float | None:
+        """Seconds since the cell ended, or since its folder changed; None if unknown."""
+        for file in (self.folder.status_file, self.folder.path):
+            try:
+                return max(0.0, time.time() - file.stat().st_mtime)
+            except OSError:
+                continue
+        return None
+
+    @cached_property
+    def bytes(self) -> int | None:
+        """The size of the cell's files; None where it can't be told."""
+        return size_of(self.folder.path)
+
+
+def latest_records(records: Mapping[str, SweepRecord]) -> dict[str, RecordedCell]:
+    """Return the row of the latest sweep that has each recorded cell, by the cell's id."""
+    rows = (row for record in records.values() for row in record.cells)
+    return {row.cell_id: row for row in rows if row.cell_id is not None}
+
+
+def cell_rows(
+    cells: Iterable[CellFolder],
+    records: Mapping[str, SweepRecord],
+    holders: Mapping[str, str],
+    *,
+    verify: bool = False,
+) -> list[CellRow]:
+    """List cells by scene, label, condition, seed and id.
+
+    Args:
+        cells: The cells' folders.
+        records: The records of sweeps, by the sweep's id, the latest last.
+        holders: Descriptions of the processes that train cells now, by the cells' ids.
+        verify: Hash the files that reports are made from; otherwise only sizes are compared.
+    """
+    recorded = latest_records(records)
+    sweeps: dict[str | None, dict[str, None]] = {}
+    for sweep_id, record in records.items():
+        for cell_id in {row.cell_id for row in record.cells}:
+            sweeps.setdefault(cell_id, {})[sweep_id] = None
+    rows = []
+    for cell in cells:
+        state = cell.state(verify=verify)
+        if state.name not in {"done", "unknown"} and cell.id in holders:
+            state = cell.running(holders[cell.id])
+        of = tuple(sweeps.get(cell.id, ()))
+        rows.append(CellRow(cell, state, recorded.get(cell.id), of, _identity(cell)))
+    return sorted(rows, key=lambda row: (row.scene, row.arm, row.seed or 0, row.id))
+
+
+def _identity(cell: CellFolder) -> Identity | None:
+    try:
+        return cell.identity()
+    except StoreError:
+        return None
+
+
+@dataclass(frozen=True)
+class SweepRow:
+    """One recorded sweep of a store."""
+
+    id: str
+    record: SweepRecord
+    recorded_at: float | None
+    """When the record was written, in seconds since the epoch; None if unknown."""
+    states: Counter[str]
+    """The number of cells in each state; `pending` ones have not begun or not ended."""
+
+
+def sweep_rows(
+    files: Mapping[str, Path],
+    records: Mapping[str, SweepRecord],
+    cells: Mapping[str, CellRow],
+) -> list[SweepRow]:
+    """List recorded sweeps, the latest last.
+
+    Args:
+        files: The file of each record, by the sweep's id.
+        records: The records, the latest last.
+        cells: The cells of the store by their ids.
+    """
+
+    def state(row: RecordedCell) -> str:
+        if row.error:
+            return "failed"
+        found = cells.get(row.cell_id or "")
+        pending = found is None or found.state.name in {"absent", "planned", "unfinished"}
+        return "pending" if found is None or pending else found.state.name
+
+    return [
+        SweepRow(name, record, _modified(files[name]), Counter(map(state, record.cells)))
+        for name, record in records.items()
+    ]
+
+
+def _modified(file: Path) -> float | None:
+    try:
+        return file.stat().st_mtime
+    except OSError:
+        return None
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Which cells of a store are meant; an empty value or 0 restricts nothing."""
+
+    ids: tuple[str, ...] = ()
+    """Ids, beginnings of ids, or names of scenes with one done cell."""
+    scenes: tuple[str, ...] = ()
+    ablations: tuple[str, ...] = ()
+    states: tuple[str, ...] = ()
+    sweeps: tuple[str, ...] = ()
+    """Ids of sweeps; a chosen cell is in one of them."""
+    older_days: float = 0.0
+    larger_mb: float = 0.0
+
+    @property
+    def restricts(self) -> bool:
+        """Whether any value restricts the choice."""
+        return self != Selection()
+
+    def of(self, cells: Sequence[CellRow]) -> list[CellRow]:
+        """Return the chosen cells.
+
+        Raises:
+            XrgsError: No cell has a name that is given, or several ids have one beginning.
+        """
+        ids = [cell.id for cell in cells]
+        wanted = {full_id(word, ids, of_scene=_done_of(word, cells)) for word in self.ids}
+        self._check("scenes", self.scenes, [cell.scene for cell in cells])
+        self._check("ablations", self.ablations, [cell.label for cell in cells])
+        self._check("states", self.states, STATES)
+        self._check("sweep", self.sweeps, [name for cell in cells for name in cell.sweeps])
+        return [
+            cell
+            for cell in cells
+            if (not wanted or cell.id in wanted)
+            and (not self.scenes or cell.scene in self.scenes)
+            and (not self.ablations or cell.label in self.ablations)
+            and (not self.states or cell.state.name in self.states)
+            and (not self.sweeps or not {*self.sweeps}.isdisjoint(cell.sweeps))
+            and (not self.older_days or (cell.age_s or 0.0) >= 86400 * self.older_days)
+            and (not self.larger_mb or (cell.bytes or 0) >= 1e6 * self.larger_mb)
+        ]
+
+    @staticmethod
+    def _check(key: str, wanted: Sequence[str], known: Sequence[str]) -> None:
+        for name in wanted:
+            if name not in known:
+                choices = ", ".join(dict.fromkeys(known)) or "none"
+                raise XrgsError(f"{key}={name}: no cell has that; choose from: {choices}")
+
+
+def _done_of(scene: str, cells: Iterable[CellRow]) -> dict[str, str]:
+    """Return the labels of the done cells of a scene, by their ids."""
+    return {c.id: c.arm for c in cells if c.scene == scene and c.state.name == "done"}
+
+
+def size_of(path: Path) -> int | None:
+    """Return the bytes of a file, or of all files of a folder; None where it can't be told."""
+    try:
+        return file_bytes(path)
+    except OSError:
+        return None
+
+
+def full_id(
+    word: str,
+    ids: Iterable[str],
+    kinds: str = "cells",
+    of_scene: Mapping[str, str] = MappingProxyType({}),
+) -> str:
+    """Return the id that a word names.
+
+    Args:
+        word: An id, the beginning of one id only, or the name of a scene with one done cell.
+        ids: The ids to choose from.
+        kinds: The things with these ids, for messages.
+        of_scene: The labels of the done cells of the scene that is named so, by their ids.
+
+    Raises:
+        StoreError: The word names none, or several.
+    """
+    known = [*ids]
+    if word in known:
+        return word
+    found = {one: "" for one in known if one.startswith(word)}
+    found |= {one: f" ({label})" for one, label in of_scene.items()}
+    if len(found) == 1:
+        return next(iter(found))
+    some = listed([f"{one}{label}" for one, label in found.items()], _MAX_LISTED)
+    why = f"no {kinds} have such an id, and no done cell is of such a scene"
+    if found:
+        why = f"several {kinds} have such an id or scene: {some}"
+    raise StoreError(f"{word}: {why}; xrgs-status lists the done ones")

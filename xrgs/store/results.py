@@ -1,0 +1,120 @@
+"""The files of cells as pandas tables: what `Store.cells` hands out."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+import numpy as np
+import pandas as pd
+
+from xrgs.errors import StoreError, XrgsError
+from xrgs.evaluation.metrics import METRICS
+from xrgs.safeio.sanitize import for_line
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping
+
+    from xrgs.store.cell_folder import CellFolder
+    from xrgs.store.schema import RecordedCell, Summary
+
+#: What a sweep's record names a cell by.
+CELL_NAMES = ("scene", "label", "condition")
+#: Groups of a cell's config that become columns; the others do not change a number.
+_CONFIG_GROUPS = ("scene", "variant", "splat", "train", "components")
+
+
+def cells_table(rows: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
+    """Make the table of `Store.cells`.
+
+    Args:
+        rows: One mapping a cell: the values of `cell_columns`, with `state` and `reason`.
+
+    Returns:
+        The cells sorted by scene, label, condition, seed and id, with the config's columns last.
+    """
+    rows = list(rows)
+    metrics = [metric.name for metric in METRICS]
+    leading = ["cell_id", *CELL_NAMES, "seed", "variant", "state", "reason", *metrics]
+    config = dict.fromkeys(key for row in rows for key in row if key not in leading)
+    table = pd.DataFrame(rows, columns=[*leading, *config])
+    table[metrics] = table[metrics].astype("float64")
+    table["seed"] = table["seed"].astype("Int64")
+    return table.sort_values([*CELL_NAMES, "seed", "cell_id"], ignore_index=True)
+
+
+def cell_columns(cell: CellFolder, names: RecordedCell | None) -> dict[str, Any]:
+    """Return what a cell's `identity.json` and `config.json` say of it, as columns of a table.
+
+    Args:
+        cell: The cell; a file that is missing or damaged in it gives no columns.
+        names: The cell's row in the record of a sweep; None where there is none.
+    """
+    identity = None
+    with suppress(StoreError):
+        identity = cell.identity()
+    try:
+        config = asdict(cell.config())
+    except XrgsError:
+        config = {}
+    settings = dict(_flat({name: config[name] for name in _CONFIG_GROUPS if name in config}))
+    return {
+        **settings,
+        "cell_id": cell.id,
+        "scene": for_line(names.scene) if names else settings.get("scene.name"),
+        "label": for_line(names.label) if names else None,
+        "condition": for_line(names.condition) if names else None,
+        "seed": identity.seed if identity else None,
+        "variant": identity.variant if identity else None,
+    }
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield nested values under dotted names, as `train.steps`."""
+    for name, value in values.items():
+        key = for_line(f"{prefix}{name}")
+        if isinstance(value, dict):
+            yield from _flat(value, f"{key}.")
+        else:
+            yield key, for_line(value) if isinstance(value, str) else value
+
+
+def over_views(views: pd.DataFrame) -> pd.DataFrame:
+    """Return the scores of each cell.
+
+    `psnr_pooled` is the PSNR of the views' squared errors together, -10 log10(mean(10^(-PSNR/10))),
+    in which each view counts once. A view that is far off counts for more in it than in the mean of
+    PSNR. `psnr_worst` is the lowest PSNR.
+
+    Args:
+        views: One row for each view: `cell_id`, `psnr` in dB, and a column for each other score.
+
+    Returns:
+        One row for each cell, indexed by its id: the mean of each score over the views,
+        `psnr_pooled` and `psnr_worst`. A score that one view lacks is NaN.
+    """
+    errors = 10 ** (-views["psnr"] / 10)
+    grouped = views.assign(psnr_pooled=errors, psnr_worst=views["psnr"]).groupby("cell_id")
+    means = grouped.mean()
+    with np.errstate(divide="ignore"):  # no error at all is infinite PSNR
+        means["psnr_pooled"] = -10 * np.log10(means["psnr_pooled"])
+    means["psnr_worst"] = grouped["psnr_worst"].min()
+    return means.mask(grouped.count().lt(grouped.size(), axis=0))
+
+
+def cell_metrics(summary: Summary, scores: pd.DataFrame) -> dict[str, float]:
+    """Return the metrics of a finished cell, by name.
+
+    Args:
+        summary: The figures of the whole cell.
+        scores: The scores of its views, as `CellFolder.scores` returns them.
+
+    Returns:
+        Figures of the whole cell, and `over_views` of its scores.
+    """
+    means = over_views(scores.assign(cell_id="")).iloc[0]
+    figures = msgspec.structs.asdict(summary)
+    whole = {m.name: float(figures[m.name]) for m in METRICS if figures.get(m.name) is not None}
+    return whole | {m.name: float(means[m.name]) for m in METRICS if m.name in means}

@@ -1,0 +1,495 @@
+"""The store: a folder that keeps variants, trained cells, sweep records and reports.
+
+Its subfolders are `scenes/`, `variants/`, `cells/<cell id>/`, `locks/`, `hydra/` (one folder per
+call of `xrgs-sweep`), `sweeps/<sweep id>.json` and `reports/<sweep id>/`. The files of a cell are
+described in `xrgs.store.cell_folder`.
+"""
+
+from __future__ import annotations
+
+import stat
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from xrgs.errors import StoreError, UnreadableError
+from xrgs.mixture import paths as variant_folders
+from xrgs.mixture.saved_variant import MANIFEST
+from xrgs.photos.scenes.scene import scene_name
+from xrgs.runtime import lease
+from xrgs.runtime.progress import log_line
+from xrgs.safeio.atomic import write_json
+from xrgs.safeio.files import is_name, is_transient, sync_name
+from xrgs.safeio.hashing import digest
+from xrgs.safeio.paths import user_path
+from xrgs.safeio.records import list_folder, read_struct
+from xrgs.safeio.sanitize import for_line
+from xrgs.store import listing
+from xrgs.store.cell_folder import IDENTITY, CellFolder, CellState
+from xrgs.store.schema import SweepRecord
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    import pandas as pd
+
+    from xrgs.store.listing import CellRow, SweepRow
+    from xrgs.store.schema import RecordedCell
+
+
+#: Label of the cells that all others are compared to.
+BASELINE = "baseline"
+#: The folder of the store where none is named.
+DEFAULT_STORE = Path("xrgs-store")
+
+#: The largest record of a sweep that is read, in bytes: 100,000 cells take 30 MB.
+MAX_RECORD_BYTES = 1 << 25
+#: Bytes that must be writable before a sweep starts; any cell needs more than that.
+_MIN_FREE_BYTES = 1 << 15
+
+
+class StoreGoneError(StoreError):
+    """The store was moved, deleted or unmounted while a sweep used it."""
+
+
+@dataclass(frozen=True)
+class Store:
+    """A store: everything that sweeps keep, in one folder.
+
+    Examples:
+        >>> cells = Store("xrgs-store").cells()
+        >>> sorted(cells["label"])
+        ['baseline', 'baseline', 'consistency', 'consistency']
+        >>> store = Store("xrgs-store")
+        >>> file = store.cell(cells["cell_id"][0]).path / "splats.ply"
+        >>> gaussians = load_gaussians(file).gaussians
+    """
+
+    path: Path
+    """The folder."""
+
+    def __init__(self, path: str | Path) -> None:
+        object.__setattr__(self, "path", Path(path))
+
+    @property
+    def scenes(self) -> Path:
+        """Folder of the rendered photographs of procedural scenes."""
+        return self.path / "scenes"
+
+    @property
+    def variants(self) -> Path:
+        """Folder of the frozen variants."""
+        return self.path / "variants"
+
+    @property
+    def cells_folder(self) -> Path:
+        """Folder of the cells."""
+        return self.path / "cells"
+
+    @property
+    def leases(self) -> Path:
+        """Folder of the leases of cells that are being trained."""
+        return self.path / "locks"
+
+    @property
+    def sweeps(self) -> Path:
+        """Folder of the records of sweeps."""
+        return self.path / "sweeps"
+
+    @property
+    def reports(self) -> Path:
+        """Folder of the reports: tables and figures."""
+        return self.path / "reports"
+
+    @property
+    def exists(self) -> bool:
+        """Whether the folder is a store: whether it is there and has a folder of cells.
+
+        Raises:
+            StoreError: It can't be told now; the message names the folder.
+        """
+        try:
+            return stat.S_ISDIR(self.cells_folder.stat().st_mode)
+        except OSError as error:
+            if is_transient(error):
+                raise UnreadableError(f"store={self.path}: {error.strerror}; try again") from error
+            return False
+
+    def check_exists(self) -> None:
+        """Refuse a folder that is not a store.
+
+        Raises:
+            StoreError: It is none, or it can't be told now.
+        """
+        if not self.exists:
+            raise StoreError(f"store={self.path} is not a store; xrgs-sweep makes one")
+
+    @property
+    def is_gone(self) -> bool:
+        """Whether a store that was prepared is no longer there; False where it can't be told now.
+
+        An empty folder in its place, as an unmounted disk leaves it, is no store.
+        """
+        try:
+            return not self.exists
+        except StoreError:
+            return False
+
+    def check_not_gone(self) -> None:
+        """Refuse to go on with a store that is gone: nothing may be created in its place.
+
+        Raises:
+            StoreGoneError: The message says what has become of the cells.
+        """
+        if self.is_gone:
+            raise StoreGoneError(
+                f"store={self.path}: it is no longer there (moved or deleted?); finished cells are"
+                " where the store went: run the same command again with store= naming that folder"
+            )
+
+    def prepare(self) -> None:
+        """Create the folder and its subfolders, and check that the disk has room.
+
+        Raises:
+            StoreError: The folder can't be written; the message names it and the `store` key.
+        """
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            for folder in (self.scenes, self.variants, self.cells_folder, self.leases, self.sweeps):
+                folder.mkdir(exist_ok=True)
+            sync_name(self.cells_folder)  # and the names of the others, which are beside it
+        except OSError as error:
+            raise self._unwritable(error) from error
+        self.check_room()
+
+    def check_room(self) -> None:
+        """Check that the disk has room, without creating the folder.
+
+        Raises:
+            StoreError: As `prepare`.
+        """
+        self._write_nameless(self.path)
+
+    def check_writable(self) -> None:
+        """Check that `prepare` could write, and leave nothing behind.
+
+        Raises:
+            StoreError: As `prepare`.
+        """
+        folder = self.path.absolute()
+        while not folder.exists() and not folder.is_symlink():
+            folder = folder.parent
+        self._write_nameless(folder)
+
+    def _write_nameless(self, folder: Path) -> None:
+        """Write a file that has no name into a folder, and so leave nothing behind."""
+        try:
+            with tempfile.TemporaryFile(dir=folder) as file:
+                file.write(bytes(_MIN_FREE_BYTES))
+        except OSError as error:
+            error.filename = str(folder)  # and not the name of the file, which is random
+            raise self._unwritable(error) from error
+
+    def _unwritable(self, error: OSError) -> StoreError:
+        return StoreError(
+            f"store={self.path} can't be written ({error.strerror}: {error.filename}): choose"
+            " another with store=..."
+        )
+
+    def cell(self, cell_id: str) -> CellFolder:
+        """Return the folder of a cell, which need not exist.
+
+        Args:
+            cell_id: The cell's id.
+
+        Raises:
+            StoreError: The id is not a valid name of a folder.
+        """
+        if not is_name(cell_id):
+            raise StoreError(f"{cell_id!r:.80} is not the id of a cell")
+        return CellFolder(self.cells_folder / cell_id)
+
+    def variant(self, variant_id: str) -> Path:
+        """Return the folder of a variant, which need not exist.
+
+        Args:
+            variant_id: The variant's id.
+
+        Raises:
+            StoreError: The id is not a valid name of a folder.
+        """
+        if not is_name(variant_id):
+            raise StoreError(f"{variant_id!r:.80} is not the id of a variant")
+        return self.variants / variant_id
+
+    def cells(self, *, verify: bool = True) -> pd.DataFrame:
+        """List the cells: what they are, whether they are done, and how they scored.
+
+        `table.loc[:, table.astype(str).nunique() > 1]` keeps the columns in which cells differ.
+
+        Args:
+            verify: Compare the hashes of each cell's results, and not only the sizes of its files.
+
+        Returns:
+            One row a cell, sorted by scene, label, condition, seed and id, with the columns
+            `cell_id`; `scene`, `label` and `condition` as the latest sweep with the cell named it
+            (missing where no sweep has it); `seed`; `variant` (its id); `state` and `reason` as of
+            `CellFolder.state`; each metric of `xrgs.evaluation.metrics.METRICS`, of the whole cell
+            or its mean over test views (NaN where there is none); and each value of its config by
+            its key, as `train.steps`.
+
+        Raises:
+            StoreError: There is no such store, or its cells can't be listed. A sweep's record that
+                can't be read is named on stderr.
+        """
+        from xrgs.store.results import cell_columns, cell_metrics, cells_table
+
+        self.check_exists()
+        table = []
+        for row in self.cell_rows(verify=verify):
+            state, metrics = row.state, {}
+            if state.name == "done":
+                try:
+                    metrics = cell_metrics(row.folder.summary(), row.folder.scores())
+                except (StoreError, OSError) as error:
+                    state = CellState.of_error(error)
+            columns: dict[str, Any] = cell_columns(row.folder, row.recorded)
+            outcome = {"state": state.name, "reason": for_line(state.reason)}
+            table.append(columns | metrics | outcome)
+        return cells_table(table)
+
+    def cell_rows(
+        self, records: Mapping[str, SweepRecord] | None = None, *, verify: bool = False
+    ) -> list[CellRow]:
+        """List the cells: id, names, state, age and size, see `xrgs.store.listing`.
+
+        Args:
+            records: The records of sweeps, as `records` returns them; None to read them, where one
+                that can't be read is named on stderr.
+            verify: As for `cells`.
+
+        Raises:
+            StoreError: There is no store, or its cells can't be listed.
+        """
+        self.check_exists()
+        records = self._records_or_warnings() if records is None else records
+        holders = lease.holders(self.leases)
+        return listing.cell_rows(self.cell_folders(), records, holders, verify=verify)
+
+    def sweep_rows(self) -> list[SweepRow]:
+        """List the recorded sweeps, the latest last.
+
+        A record that can't be read is named on stderr, and left out.
+
+        Raises:
+            StoreError: There is no store, or it can't be listed.
+        """
+        records = self._records_or_warnings()
+        cells = {row.id: row for row in self.cell_rows(records)}
+        files = {sweep_id: self.sweeps / f"{sweep_id}.json" for sweep_id in records}
+        return listing.sweep_rows(files, records, cells)
+
+    def cell_names(self) -> dict[str, RecordedCell]:
+        """Return the row of the latest sweep that has each recorded cell, by the cell's id."""
+        return listing.latest_records(self._records_or_warnings())
+
+    def sweeps_of(self, cell_id: str) -> list[str]:
+        """Return the ids of the recorded sweeps that have a cell, the latest last."""
+        records = self._records_or_warnings()
+        return [i for i, r in records.items() if any(row.cell_id == cell_id for row in r.cells)]
+
+    def _records_or_warnings(self) -> dict[str, SweepRecord]:
+        try:
+            records, damaged = self.records()
+        except StoreError as error:
+            records, damaged = {}, (str(error),)
+        for message in damaged:
+            log_line(f"{message}; its names of cells are left out")
+        return records
+
+    def find_cell(self, word: str) -> CellFolder:
+        """Return the cell that a word names.
+
+        Args:
+            word: The cell's id, or so much of it that it is that of one cell; the name of a scene
+                that one done cell is of; or a path to the cell's folder or the scene's.
+
+        Raises:
+            StoreError: There is no store, the word names no cell, or it names several.
+        """
+        if (folder := user_path(word) / IDENTITY).is_file():
+            return CellFolder(folder.parent.absolute())
+        self.check_exists()
+        return self.cell(self._full_id(word, [cell.id for cell in self.cell_folders()], "cells"))
+
+    def find_folder(self, word: str) -> Path:
+        """Return the folder of the cell or the variant that a word names.
+
+        Args:
+            word: As for `find_cell`, or the same of a variant.
+
+        Raises:
+            StoreError: There is no store, the word names no cell or variant, or it names several.
+        """
+        if any((user_path(word) / name).is_file() for name in (IDENTITY, MANIFEST)):
+            return user_path(word)
+        self.check_exists()
+        variants = filter(variant_folders.is_variant, list_folder(self.variants))
+        folders = {name: self.variant(name) for name in variants}
+        folders |= {cell.id: cell.path for cell in self.cell_folders()}
+        return folders[self._full_id(word, list(folders), "cells or variants")]
+
+    def find_sweep(self, word: str) -> str:
+        """Return the id of the sweep that a word names; of a scene, that of its latest sweep.
+
+        Args:
+            word: The sweep's id, or so much of it that it is that of one sweep; or the name of a
+                scene, or a path to its folder.
+
+        Raises:
+            StoreError: There is no store, or the word names no sweep, or several.
+        """
+        self.check_exists()
+        records, name = self._records_or_warnings(), _name_of(word)
+        of_scene = [i for i, r in records.items() if any(row.scene == name for row in r.cells)]
+        latest = {of_scene[-1]: name} if of_scene else {}
+        return listing.full_id(name, self.sweep_ids(), "sweeps", latest)
+
+    def _full_id(self, word: str, ids: Sequence[str], kinds: str) -> str:
+        """Return the one id that a word names."""
+        name = _name_of(word)
+        of_scene = {
+            cell_id: row.label
+            for cell_id, row in self.cell_names().items()
+            if row.scene == name and self.cell(cell_id).state(verify=False).name == "done"
+        }
+        return listing.full_id(name, ids, kinds, of_scene)
+
+    def cell_folders(self) -> list[CellFolder]:
+        """Return the cells, sorted by id; folders of earlier attempts, whose names have a dot, not.
+
+        Whatever else has the name of a cell is among them, a link or a file: its state says so.
+
+        Raises:
+            StoreError: The folder of cells can't be listed; the message names it.
+        """
+        names = list_folder(self.cells_folder)
+        return [self.cell(name) for name in names if "." not in name and is_name(name)]
+
+    def sweep_ids(self) -> list[str]:
+        """Return the ids of the recorded sweeps, oldest first.
+
+        Raises:
+            StoreError: The folder of the records can't be listed; the message names it.
+        """
+        names = [name for name in list_folder(self.sweeps) if name.endswith(".json")]
+        files = [self.sweeps / name for name in names if is_name(name)]
+        times = {file.stem: _modified_ns(file) for file in files}
+        return sorted(times, key=lambda sweep_id: (times[sweep_id], sweep_id))
+
+    def records(self) -> tuple[dict[str, SweepRecord], tuple[str, ...]]:
+        """Read the records of all sweeps.
+
+        Returns:
+            The records that can be read, by the sweep's id, oldest first, and for each other one a
+            message that names its file.
+
+        Raises:
+            StoreError: As `sweep_ids`.
+        """
+        records, damaged = {}, []
+        for sweep_id in self.sweep_ids():
+            try:
+                records[sweep_id] = self.sweep_record(sweep_id)
+            except StoreError as error:
+                damaged.append(str(error))
+        return records, tuple(damaged)
+
+    def write_sweep(
+        self, command: Sequence[str], cells: Sequence[RecordedCell], sweep_id: str | None = None
+    ) -> str:
+        """Record which cells a sweep compares, for its report: when it starts, and at its end.
+
+        Args:
+            command: Arguments of `xrgs-sweep`.
+            cells: The cells.
+            sweep_id: The id that the sweep has already, whose record is replaced; None when it
+                starts.
+
+        Returns:
+            The id of the record. Sweeps that ask for the same cells have the same id, however many
+            of the cells are done.
+        """
+        rows = msgspec.to_builtins(tuple(cells))
+        record = SweepRecord(1, tuple(command), tuple(cells), digest(rows))
+        sweep_id = sweep_id or digest([_asked_for(row) for row in rows])
+        write_json(self.sweeps / f"{sweep_id}.json", msgspec.to_builtins(record))
+        return sweep_id
+
+    def latest_sweep(self) -> str:
+        """Return the id of the sweep that was recorded last, of those that can be read.
+
+        A newer record that can't be read is named on stderr.
+
+        Raises:
+            StoreError: There is no store, or it has no record of a sweep, or none that can be read.
+        """
+        self.check_exists()
+        sweep_ids = self.sweep_ids()
+        if not sweep_ids:
+            raise StoreError(f"store={self.path} holds no sweep: run xrgs-sweep first")
+        damaged = []
+        for sweep_id in reversed(sweep_ids):
+            try:
+                self.sweep_record(sweep_id)
+            except StoreError as error:
+                damaged.append(error)
+                continue
+            for newer in damaged:
+                log_line(f"{newer}; the sweep before it is taken")
+            return sweep_id
+        raise damaged[0]
+
+    def sweep_record(self, sweep_id: str | None = None) -> SweepRecord:
+        """Return the record of a sweep; None for the latest.
+
+        Raises:
+            StoreError: There is no such record, or it is damaged or of another version.
+        """
+        sweep_id = sweep_id or self.latest_sweep()
+        if not is_name(sweep_id):
+            raise StoreError(f"{sweep_id!r:.80} is not the id of a sweep")
+        return read_struct(self.sweeps / f"{sweep_id}.json", SweepRecord, MAX_RECORD_BYTES)
+
+    def verify_sweep(self, sweep_id: str) -> None:
+        """Check that a sweep's record is the one that was written, by the hash in it.
+
+        Raises:
+            StoreError: The record can't be read, or has changed; the message names the file.
+        """
+        record = self.sweep_record(sweep_id)
+        if digest(msgspec.to_builtins(record.cells)) != record.digest:
+            file = self.sweeps / f"{sweep_id}.json"
+            raise StoreError(f"{file}: its cells have changed since it was written")
+
+
+def _name_of(word: str) -> str:
+    """Return the name of the scene where a word is a folder, and else the word."""
+    return scene_name(user_path(word)) if user_path(word).is_dir() else word
+
+
+def _asked_for(row: dict[str, Any]) -> dict[str, Any]:
+    """Return what a row of a record says of a cell before any cell is trained."""
+    names = ("scene", "label", "condition", "variant_seed", "seed", "variant_id", "planned_id")
+    return {name: row[name] for name in names}
+
+
+def _modified_ns(file: Path) -> int:
+    """Return when a file was changed; 0 where that can't be told."""
+    try:
+        return file.stat().st_mtime_ns
+    except OSError:
+        return 0

@@ -1,0 +1,132 @@
+"""Removes the heavy files of done cells and of variants, and records what was removed.
+
+A trimmed cell stays done: the files that tables are made of stay, and its `status.json` lists the
+removed files with their sizes and hashes. A trimmed variant keeps its list of views, cameras,
+points and SfM report, in the folder `variants/trimmed-<id>`. Its cells are still found and
+reported. Before a new cell is trained on it, its images are made again from the photographs. SfM is
+not run again: on another machine it may place the cameras otherwise.
+"""
+
+from __future__ import annotations
+
+import stat
+from typing import TYPE_CHECKING
+
+from xrgs.errors import StoreError, UnreadableError, XrgsError
+from xrgs.mixture import saved_variant
+from xrgs.mixture.paths import id_of, is_trimmed, trimmed_folder
+from xrgs.runtime import lease
+from xrgs.safeio import checksums
+from xrgs.safeio.files import remove_path, sync_name, sync_tree, walk_files
+from xrgs.safeio.records import list_folder
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from xrgs.config import SceneConf, VariantConf
+
+_IMAGES = "images"
+
+
+def trimmed_variant(variants: Path, key: str) -> str | None:
+    """Return the id of the trimmed variant of a key (`xrgs.mixture.variant.key`), or None.
+
+    Raises:
+        StoreError: The folder of variants can't be listed.
+    """
+    ids = map(id_of, filter(is_trimmed, list_folder(variants)))
+    return next((variant_id for variant_id in ids if variant_id.startswith(f"{key}-")), None)
+
+
+def check_images(variants: Path, variant_id: str) -> None:
+    """Raise `StoreError` where a variant is trimmed; the message says what can be done."""
+    folder = trimmed_folder(variants, variant_id)
+    if folder.is_dir():
+        raise StoreError(
+            f"variant {variant_id}: its images were removed by xrgs-store trim; xrgs-sweep makes"
+            " them again when it trains a cell on this variant"
+        )
+
+
+def trim_variant(variants: Path, variant_id: str) -> None:
+    """Remove the images of a variant, and mark it as trimmed by the name of its folder.
+
+    Trimming a trimmed variant completes a removal that was stopped, and else changes nothing.
+
+    Raises:
+        OSError: The folder can't be renamed, or the images can't be removed.
+    """
+    folder, trimmed = variants / variant_id, trimmed_folder(variants, variant_id)
+    if folder.is_dir():
+        folder.rename(trimmed)
+        sync_name(trimmed)
+    remove_path(trimmed / _IMAGES)
+
+
+def restore_variant(
+    variants: Path,
+    variant_id: str,
+    scene: SceneConf,
+    conf: VariantConf,
+    cache: Path,
+) -> None:
+    """Make the images of a trimmed variant again; any number of processes may call this at once.
+
+    Nothing happens to a variant that has its images.
+
+    Args:
+        variants: The store's folder of variants.
+        variant_id: The variant's id.
+        scene: The config of the variant's scene.
+        conf: The config that the variant was built with.
+        cache: The store's folder of rendered scenes.
+
+    Raises:
+        UnreadableError: A photograph can't be read now.
+        StoreError: The images can't be made again; the message says why. The variant stays trimmed.
+        OSError: The store can't be written.
+    """
+    from xrgs.store.restore import restore_images
+
+    folder, key = trimmed_folder(variants, variant_id), variant_id.rpartition("-")[0]
+    with lease.waited_for(variants, f".{key}.lock"):
+        if not folder.is_dir():
+            return
+        work = variants / f".{variant_id}.restoring"
+        remove_path(work)  # what a killed process left, as in the variant's own folder
+        remove_path(folder / _IMAGES)
+        work.mkdir()
+        try:
+            restore_images(folder, scene, conf, work, cache)
+        except XrgsError as error:
+            remove_path(folder / _IMAGES)
+            if isinstance(error, UnreadableError):
+                raise
+            raise StoreError(
+                f"variant {variant_id}: its images were removed by xrgs-store trim, and can't be"
+                f" made again: {error}. Remove {folder} to let another variant be built, on which"
+                " all cells of the comparison are trained anew; the reports of the old ones stay"
+            ) from error
+        finally:
+            remove_path(work)
+        sync_tree(folder)
+        folder.rename(variants / variant_id)
+        sync_name(variants / variant_id)
+
+
+def image_bytes(variants: Path, variant_id: str) -> int:
+    """Return the bytes of a variant's images, which trimming it would free."""
+    homes = (variants / variant_id, trimmed_folder(variants, variant_id))
+    images = [home / _IMAGES for home in homes if (home / _IMAGES).is_dir()]
+    found = [status for folder in images for _, status in walk_files(folder)]
+    return sum(status.st_size for status in found if stat.S_ISREG(status.st_mode))
+
+
+def verify_variant(folder: Path) -> list[str]:
+    """Return a line for each file of a trimmed variant that is missing, changed or unreadable."""
+    try:
+        content = saved_variant.read_manifest(folder)
+    except StoreError as error:
+        return [str(error)]
+    kept = {saved_variant.POINTS: content.files[saved_variant.POINTS]}
+    return list(map(str, checksums.changed(folder, kept)))

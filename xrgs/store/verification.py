@@ -1,0 +1,140 @@
+"""Hashes everything that a store keeps: cells, variants, rendered scenes and records of sweeps."""
+
+from __future__ import annotations
+
+import stat
+import time
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING
+
+from xrgs.errors import StoreError
+from xrgs.mixture import paths, variant
+from xrgs.photos import scenes
+from xrgs.runtime.progress import ProgressBar
+from xrgs.runtime.text import format_size
+from xrgs.safeio.files import walk_files
+from xrgs.safeio.records import list_folder
+from xrgs.safeio.sanitize import for_line
+from xrgs.store import trimming
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from xrgs.store.store import Store
+
+    _Checks = Iterator[tuple[Path, Callable[[], list[str]]]]
+
+
+@dataclass(frozen=True)
+class Verification:
+    """How much was hashed, and what is damaged."""
+
+    files: int
+    bytes: int
+    seconds: float
+    damage: tuple[str, ...]
+    """A line for each file that is missing, damaged, changed, unreadable or not listed. The line
+    begins with the path."""
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A cell, a variant, a scene or a record, with its check."""
+
+    path: Path
+    files: int
+    bytes: int
+    verify: Callable[[], list[str]]
+
+
+def verify(store: Store) -> Verification:
+    """Hash every file of the finished cells, the frozen variants, the scenes and the records.
+
+    Raises:
+        StoreError: There is no such store, or it can't be read now.
+    """
+    if not store.exists:
+        raise StoreError(f"store={store.path} is not a store; xrgs-sweep makes one")
+    start = time.perf_counter()
+    damage: list[str] = []
+    parts = list(_parts(store, damage))
+    total = sum(part.bytes for part in parts)
+    with ProgressBar("hashing", "byte", total) as bar:
+        for part in parts:
+            damage += part.verify()
+            bar.update(part.bytes)
+    seconds = time.perf_counter() - start
+    return Verification(sum(part.files for part in parts), total, seconds, tuple(damage))
+
+
+def describe(verification: Verification) -> str:
+    """Return the damaged files and the extent of a verification, as lines for a terminal."""
+    damage = verification.damage
+    lines = ["damaged, or can't be read now:", *(f"  {line}" for line in damage)] if damage else []
+    extent = f"{verification.files:,} files, {format_size(verification.bytes)}"
+    found = f"{len(damage)} damaged" if damage else "all of them as they were written"
+    lines.append(f"hashed: {extent}, in {verification.seconds:.1f} s; {found}")
+    return "\n".join(map(for_line, lines))
+
+
+def _parts(store: Store, damage: list[str]) -> Iterator[_Part]:
+    """Yield the parts of a store; add a line to `damage` for each that can't be listed."""
+    for kind in (_cells, _variants, _scenes, _records):
+        try:
+            checks = list(kind(store))
+        except StoreError as error:
+            damage.append(str(error))
+            continue
+        for path, check in checks:
+            try:
+                files, size = _extent(path)
+            except OSError as error:
+                damage.append(f"{error.filename}: {error.strerror}")
+                continue
+            yield _Part(path, files, size, check)
+
+
+def _cells(store: Store) -> _Checks:
+    for cell in store.cell_folders():
+        state = cell.state(verify=False)
+        if state.name == "done":
+            yield cell.path, cell.verify
+        elif state.name in {"corrupt", "unknown"}:
+            yield cell.path, partial(list, [f"{cell.path}: {state.reason}"])
+
+
+def _variants(store: Store) -> _Checks:
+    for name in list_folder(store.variants):
+        if paths.is_variant(name):
+            folder = store.variants / name
+            check = trimming.verify_variant if paths.is_trimmed(name) else variant.verify
+            yield folder, partial(check, folder)
+
+
+def _scenes(store: Store) -> _Checks:
+    for name in list_folder(store.scenes):
+        if not name.startswith("."):
+            folder = store.scenes / name
+            yield folder, partial(scenes.verify, folder)
+
+
+def _records(store: Store) -> _Checks:
+    for sweep_id in store.sweep_ids():
+        yield store.sweeps / f"{sweep_id}.json", partial(_record, store, sweep_id)
+
+
+def _record(store: Store, sweep_id: str) -> list[str]:
+    try:
+        store.verify_sweep(sweep_id)
+    except StoreError as error:
+        return [str(error)]
+    return []
+
+
+def _extent(path: Path) -> tuple[int, int]:
+    """Return the number of regular files at a path or below, and their bytes."""
+    found = [status for _, status in walk_files(path)] if path.is_dir() else [path.lstat()]
+    sizes = [status.st_size for status in found if stat.S_ISREG(status.st_mode)]
+    return len(sizes), sum(sizes)

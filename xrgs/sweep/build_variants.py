@@ -1,0 +1,381 @@
+"""Finds the frozen variant of a config in the store, or builds it in a process of its own."""
+
+from __future__ import annotations
+
+import shlex
+import threading
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+from xrgs.config import CONF_DIR
+from xrgs.errors import StoreError, UnreadableError, XrgsError
+from xrgs.mixture import photographs, split, variant
+from xrgs.mixture.degradations import DEGRADATIONS, resolve_degradation
+from xrgs.mixture.paths import failed_folder, trimmed_folder
+from xrgs.photos import scenes
+from xrgs.runtime.machine import usable_cores, usable_memory
+from xrgs.runtime.progress import log_line
+from xrgs.safeio.files import is_transient
+from xrgs.safeio.sanitize import counted
+from xrgs.store import trimming
+from xrgs.store.inspect import read_report
+from xrgs.store.store import StoreGoneError
+from xrgs.sweep.jobs import worker
+from xrgs.sweep.jobs.supervise import Limits
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping, Sequence
+
+    from xrgs.config import Conf, SceneConf, VariantConf
+    from xrgs.store.store import Store
+
+_Result = TypeVar("_Result")
+#: Memory that a build may take; fern and flower take 0.6 GB each at 500 px.
+_BUILD_BYTES = 2 << 30
+
+
+@dataclass(frozen=True)
+class PlannedVariant:
+    """The variant of a config, for the plan of a sweep; without values while it is not built."""
+
+    id: str | None = None
+    error: str | None = None
+    """Why no variant can be made of the scene."""
+    remembered: bool = False
+    """Whether the store keeps the error, so that only `retry=failed` tries the scene again."""
+    unknown: str | None = None
+    """The file that can't be read now."""
+    notes: tuple[str, ...] = ()
+    """What its report says, or in a dry run what the report of a new variant would say."""
+
+
+def build(conf: Conf, store: Store) -> str:
+    """Build the variant of a config in a child process, and return its id.
+
+    Args:
+        conf: A cell's config, of which only scene and variant are read.
+        store: The store to build it in.
+
+    Raises:
+        UnwritableError: The disk is full or can't be written.
+        UnreadableError: A file can't be read now.
+        StoreGoneError: The store is no longer there.
+        XrgsError: The photographs are missing, or can't be made into a variant.
+    """
+    return _build(conf, store, "", store.check_not_gone, {})
+
+
+def _build(
+    conf: Conf,
+    store: Store,
+    place: str,
+    check: Callable[[], None],
+    environment: Mapping[str, str],
+) -> str:
+    """Build a variant, and say its place among several.
+
+    An exception that `check` raises meanwhile ends the child.
+    """
+    _check_held_out(scenes.names(conf.scene, conf.variant.long_side), conf)  # SfM takes minutes
+    work = "building the mixed-resolution variant"
+    if resolve_degradation(conf.variant) == "none":
+        work = "finding the cameras" if conf.variant.poses is None else "reading the cameras"
+    log_line(f"{scenes.label(conf.scene)}: {work}{place}")
+    request = {"conf": asdict(conf), "store": str(store.path)}
+    answer = worker.run_in_child("variant", request, Limits(), lambda _: check(), environment)
+    return str(answer["variant"])
+
+
+def restore(conf: Conf, store: Store, variant_id: str) -> None:
+    """Make the images of a trimmed variant again, in a child process.
+
+    Args:
+        conf: The config of a cell of the variant, of which only scene and variant are read.
+        store: The store.
+        variant_id: The variant's id. A variant that is not trimmed is left as it is.
+
+    Raises:
+        UnwritableError: The disk is full or can't be written.
+        UnreadableError: A file can't be read now.
+        StoreGoneError: The store is no longer there.
+        XrgsError: The photographs are missing, or give other images.
+    """
+    if not trimmed_folder(store.variants, variant_id).is_dir():
+        return
+    log_line(f"variant {variant_id}: making the images again that xrgs-store trim has removed")
+    request = {"conf": asdict(conf), "store": str(store.path), "variant": variant_id}
+    worker.run_in_child("restore", request, Limits(), lambda _: store.check_not_gone())
+
+
+def how_to_get(scenes: Iterable[SceneConf]) -> str:
+    """Return how to get scenes of `conf/scene` whose photographs are missing; empty if none are."""
+    from omegaconf import OmegaConf
+
+    absent: dict[str, Path] = {}
+    for scene in scenes:
+        path = Path(scene.path or "")
+        if path.name == scene.name and not path.exists():
+            absent[scene.name] = path
+    near = {name: found for name, path in absent.items() if (found := _root_near(path))}
+    hints = [f"{root}/{name} is there: data_root={root}" for name, root in near.items()]
+    absent = {name: path for name, path in absent.items() if name not in near}
+    missing: dict[tuple[str, Path], list[str]] = {}
+    for file in sorted((CONF_DIR / "data").glob("*.yaml")):
+        published = OmegaConf.load(file).scenes
+        for name, path in absent.items():
+            if name in published:
+                missing.setdefault((file.stem, path.parent), []).append(name)
+    usual = Path(OmegaConf.load(CONF_DIR / "config.yaml").data_root)
+    commands = [
+        f"xrgs-data download {dataset} {' '.join(names)}"
+        + ("" if root == usual else f" --data-root {shlex.quote(str(root))}")
+        for (dataset, root), names in missing.items()
+    ]
+    hints += [f"to download what is missing: {'; '.join(commands)}"] if commands else []
+    captures = {file.stem for file in (CONF_DIR / "scene/captures").glob("*.yaml")}
+    if own := [str(path) for name, path in absent.items() if name in captures]:
+        hints.append(
+            "no command downloads the captures: docs/study.md says where their photographs are from"
+            f" (section Scenes); they belong into {', '.join(own)}"
+        )
+    return "\n".join(hints)
+
+
+def _root_near(missing: Path) -> str:
+    """Return the right `data_root`, a level below or above a wrong one; empty if there is none."""
+    root, name = missing.parent, missing.name
+    found = [folder.parent for folder in sorted(root.glob(f"*/{name}")) if folder.is_dir()]
+    found += [root.parent] if root.name == name and root.is_dir() else []
+    return shlex.quote(str(found[0])) if found else ""
+
+
+def find_or_build(conf: Conf, store: Store) -> str:
+    """Return the id of the frozen variant of a config, and build it if the store lacks it.
+
+    Raises:
+        XrgsError: The photographs are missing, or can't be made into a variant.
+    """
+    if hint := how_to_get([conf.scene]):
+        raise XrgsError(f"scene.path={conf.scene.path}: no such folder; {hint}")
+    frozen = variant.find(store.variants, variant.key(conf.scene, conf.variant))
+    if frozen is not None:
+        return frozen.id
+    store.prepare()
+    return build(conf, store)
+
+
+def plan(confs: Sequence[Conf], store: Store, *, allow_build: bool) -> list[PlannedVariant]:
+    """Return the variants of configs for a sweep, or the reasons why there are none.
+
+    The variants that the store lacks are built, several at once. A scene that failed before is not
+    tried again, like a failed cell, unless `retry=failed`.
+
+    Args:
+        confs: Configs of cells, one for each variant.
+        store: The store.
+        allow_build: Build the variants that the store lacks; False for a dry run.
+
+    Raises:
+        StoreError: The store can't be written, or is no longer there.
+    """
+    known = [_outcome(_known, conf, store) for conf in confs]
+    lacking = {i: confs[i] for i, found in enumerate(known) if found is None}
+    if allow_build:
+        made = _build_all(lacking, len(confs), store)
+    else:  # not before a build: a header may be of a file that can't be decoded, and is left out
+        made = {i: _outcome(_expected, conf, store) for i, conf in lacking.items()}
+    return [found or made[i] for i, found in enumerate(known)]
+
+
+def _known(conf: Conf, store: Store) -> PlannedVariant | None:
+    """Return what the store knows of a config's variant; None where it is to be built."""
+    key = variant.key(conf.scene, conf.variant)
+    frozen = variant.find(store.variants, key)
+    if frozen is not None:
+        return _found(conf, store, frozen.id, store.variants / frozen.id)
+    # The done cells of a trimmed variant are found by its id; a job that trains another cell makes
+    # the images again.
+    if trimmed := trimming.trimmed_variant(store.variants, key):
+        return _found(conf, store, trimmed, trimmed_folder(store.variants, trimmed))
+    return None if conf.retry == "failed" else _failed_before(store, key)
+
+
+def _expected(conf: Conf, store: Store) -> PlannedVariant:
+    """Return a variant that a dry run does not build, with the notes that it would have."""
+    return PlannedVariant(notes=_expected_notes(conf, store))
+
+
+def _build_all(lacking: Mapping[int, Conf], total: int, store: Store) -> dict[int, PlannedVariant]:
+    """Build variants, several at once.
+
+    COLMAP finds the cameras of a scene on one core: a single build would leave the others idle.
+
+    Args:
+        lacking: Configs by their place among all variants of the sweep.
+        total: How many these are.
+        store: The store.
+    """
+    cores = usable_cores()
+    at_once = max(1, min(len(lacking), cores, usable_memory() // _BUILD_BYTES))
+    environment = {"PYTHON_CPU_COUNT": str(cores // at_once)}
+    if at_once > 1:
+        environment["TQDM_DISABLE"] = "1"  # the bars of several builds would overwrite each other
+    ended = threading.Event()
+
+    def check() -> None:
+        store.check_not_gone()
+        if ended.is_set():
+            raise worker.InterruptedWorkError("the sweep has ended")
+
+    def build_one(i: int, conf: Conf, store: Store) -> PlannedVariant:
+        place = f" {i + 1} of {total}" if total > 1 else ""
+        built = _build(conf, store, place, check, environment)
+        return PlannedVariant(built, notes=_notes(store.variants / built))
+
+    with ThreadPoolExecutor(at_once) as pool:
+        builds = {
+            i: pool.submit(_outcome, partial(build_one, i), conf, store, building=True)
+            for i, conf in lacking.items()
+        }
+        try:
+            for build in as_completed(builds.values()):
+                build.result()
+        finally:  # an error or a signal ends the other builds
+            ended.set()
+            pool.shutdown(cancel_futures=True)
+    return {i: build.result() for i, build in builds.items()}
+
+
+def _outcome(
+    work: Callable[[Conf, Store], _Result], conf: Conf, store: Store, *, building: bool = False
+) -> _Result | PlannedVariant:
+    """Return what `work` returns for a config, or the reason why the scene has no variant.
+
+    Raises:
+        StoreError: The store can't be written, or is no longer there.
+    """
+    try:
+        return work(conf, store)
+    except worker.UnwritableError as error:
+        raise StoreError(f"store={store.path}: {error}. {worker.NOTHING_LOST}") from error
+    except StoreGoneError:
+        raise
+    except UnreadableError as error:
+        reason = str(error)
+    except OSError as error:
+        if not is_transient(error):
+            raise
+        reason = str(error)
+    except XrgsError as error:
+        if building:
+            store.check_not_gone()
+            # COLMAP dies of a full disk without saying so. The scene is not at fault then.
+            store.check_room()
+        # The reason that the store keeps: a sweep that is planned again has the same record then.
+        return _failure(conf, store) or PlannedVariant(error=str(error))
+    return PlannedVariant(unknown=f"its variant can't be read now: {reason}")
+
+
+def _failure(conf: Conf, store: Store) -> PlannedVariant | None:
+    try:
+        return _failed_before(store, variant.key(conf.scene, conf.variant))
+    except XrgsError:  # the photographs are not there, or the reason can't be read now
+        return None
+
+
+def _failed_before(store: Store, key: str) -> PlannedVariant | None:
+    """Return the failure of a scene that the store keeps; None where there is none."""
+    failure = variant.failure(store.variants, key)
+    if not failure:
+        return None
+    notes = _notes(failed_folder(store.variants, key))
+    return PlannedVariant(error=failure, remembered=True, notes=notes)
+
+
+def _found(conf: Conf, store: Store, variant_id: str, folder: Path) -> PlannedVariant:
+    """Return a variant that was built before, with the notes of its report.
+
+    Files that came into the scene's folder since then, as a store, are left out and said too.
+    """
+    now = _scene(conf, store).notes if conf.scene.kind == "folder" else ()
+    return PlannedVariant(variant_id, notes=tuple(dict.fromkeys((*now, *_notes(folder)))))
+
+
+def _scene(conf: Conf, store: Store) -> scenes.Scene:
+    """List the photographs of a folder."""
+    return scenes.resolve(conf.scene, store.scenes, conf.variant.long_side)
+
+
+def _notes(folder: Path) -> tuple[str, ...]:
+    """Return what the report of a variant, or of a scene that failed, says of its photographs.
+
+    Raises:
+        UnreadableError: The report can't be read now.
+    """
+    try:
+        return read_report(folder).all_notes()
+    except UnreadableError:
+        raise
+    except StoreError as error:
+        return (str(error),)
+
+
+def _expected_notes(conf: Conf, store: Store) -> tuple[str, ...]:
+    """Say what a variant of photographs would leave out, from their names and headers alone.
+
+    Raises:
+        UnreadableError: A photograph can't be read now.
+        XrgsError: No variant can be made, even if SfM places every photograph.
+    """
+    names = scenes.names(conf.scene, conf.variant.long_side)
+    sizes, notes = [(1, 1)] * len(names), list[str]()  # other kinds make views of one size
+    if conf.scene.kind == "folder":
+        scene = _scene(conf, store)
+        photos = photographs.expected_photographs(scene, conf.variant)
+        names, sizes = photos.names, [photo.size for photo in photos.all]
+        notes = [*scene.notes, *photos.notes]
+    _check_held_out(names, conf, notes)
+    parts = split.split_before_sfm(names, sizes, conf.variant)
+    if conf.scene.kind == "folder":
+        notes.append(_what_becomes_of_them(parts, conf.variant))
+    return *notes, *split.split_notes(parts, conf.variant)
+
+
+def _what_becomes_of_them(parts: split.Split, conf: VariantConf) -> str:
+    """Say how many photographs are held out, trained on, and degraded."""
+    trained, tests, way = len(parts.hr) + len(parts.lr), len(parts.test), resolve_degradation(conf)
+    said = f"{counted(trained + tests, 'photograph')}: {tests} held out, {trained} to train on"
+    if way == "none" or not parts.lr:
+        return f"{said}, as they are"
+    smaller = way in DEGRADATIONS and DEGRADATIONS[way].smaller
+    made = f"made {conf.factor} times smaller" if smaller else f"degraded by {way}"
+    lr = f"{len(parts.lr)} of which are {made}"
+    return f"{said}, {lr}; variant.hr_fraction=1 leaves them as they are"
+
+
+def _check_held_out(names: Sequence[str], conf: Conf, notes: Iterable[str] = ()) -> None:
+    """Refuse photographs of which too few are trained on, or none tested, even if all are placed.
+
+    Args:
+        names: The names of the photographs, sorted. Some may turn out to be unreadable, and leave
+            even fewer.
+        conf: A cell's config.
+        notes: What else is said of the photographs.
+
+    Raises:
+        XrgsError: There are too few; the message says what helps.
+    """
+    parts = split.split_views(names, conf.variant)
+    if not split.shortage(parts, set(range(len(names))), conf.variant):
+        return
+    held_out, left = len(parts.test), len(parts.hr) + len(parts.lr)
+    which = f"{held_out} {'is' if held_out == 1 else 'are'} held out to test on"
+    why = f"{which}, and {left} left to train on, which takes two"
+    helps = "hold none out: variant.test_every=0, or xrgs-train --all"
+    if conf.variant.test:
+        helps = "name fewer or others in variant.test"
+    few = f"scene {scenes.label(conf.scene)}: {counted(len(names), 'photograph')} are too few"
+    raise XrgsError("; ".join([f"{few}: {why}. Add photographs, or {helps}", *notes]))
