@@ -416,7 +416,6 @@ def _hand_over(cell: PlannedCell, threads: int, store: Store) -> list[str]:
         scene=replace(scene, path=path, masks=masks),
     )
     # Under the lease: another sweep may be training the cell, or have finished it, since the plan.
-    # A dead owner that this process has watched for long enough need not be watched by the job.
     held = lease.acquire(store.leases, cell.cell_id)
     if held is not None:
         try:

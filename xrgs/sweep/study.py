@@ -401,7 +401,8 @@ def _tidy(done: set[str], store: Store) -> None:
         for cell_id in done:
             store.cell(cell_id).drop_checkpoint()
         for cell_id in done & lease.names(store.leases):
-            lease.free_if_dead(store.leases, cell_id)
+            if (held := lease.acquire(store.leases, cell_id)) is not None:
+                held.release()
 
 
 def _without_reference(cell: PlannedCell) -> PlannedCell:
