@@ -39,7 +39,9 @@ _VERIFIED_BY_HASH = frozenset(
     {"config.json", "identity.json", "scores.csv", "summary.json", "history.csv", "quality.csv"}
 )
 CONFIG, IDENTITY, CHECKPOINT, LOG = "config.json", "identity.json", "checkpoint.npz", "log.txt"
-_NOT_RESULTS = frozenset({LOG, "status.json", "progress.json", CHECKPOINT, f"refused-{CHECKPOINT}"})
+STATUS = "status.json"
+#: Files in the folder of a done cell that its status does not list.
+NOT_RESULTS = frozenset({LOG, STATUS, "progress.json", CHECKPOINT, f"refused-{CHECKPOINT}"})
 
 
 @dataclass(frozen=True)
@@ -88,7 +90,7 @@ class CellFolder:
     @property
     def status_file(self) -> Path:
         """File of the final state, written after all other files."""
-        return self.path / "status.json"
+        return self.path / STATUS
 
     # State
 
@@ -170,7 +172,7 @@ class CellFolder:
         try:
             status = self.status()
             wrong = [line for name, of in status.files.items() if (line := self._wrong(name, of))]
-            listed = status.files.keys() | status.trimmed.keys() | _NOT_RESULTS
+            listed = status.files.keys() | status.trimmed.keys() | NOT_RESULTS
             wrong += [
                 f"{self.path}/{name}: it does not belong there"
                 for name, _ in walk_files(self.path)
@@ -217,7 +219,7 @@ class CellFolder:
         files = {
             name: FileEntry(status.st_size, file_digest(self.path / name))
             for name, status in sorted(walk_files(self.path))
-            if name not in _NOT_RESULTS
+            if name not in NOT_RESULTS
         }
         self._write_status(
             Status("done", views=tuple(views), files=files, scored_by=dict(scored_by))
