@@ -190,8 +190,8 @@ def _look(words: _Words) -> _Found | None:
     if not conf.dry_run:
         store.prepare()
     (planned,) = variants.plan([conf], store, allow_build=not conf.dry_run)
-    if planned.error or planned.unknown:
-        raise XrgsError(planned.error or f"{planned.unknown}; run the same command again")
+    if planned.error:
+        raise XrgsError(planned.error)
     for note in planned.notes:
         if not note.startswith(_FOR_STUDIES):
             _say(f"  {note}")

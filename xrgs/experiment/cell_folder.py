@@ -50,18 +50,19 @@ class CellState:
 
     name: str
     """`absent`, `planned` (a sweep has written its config), `unfinished`, `running`, `failed`,
-    `corrupt` or `done`; `unknown` where a file can't be read now: look again later."""
+    `corrupt` or `done`."""
     reason: str = ""
+    unreadable: bool = False
+    """Whether it is `failed` since a file can't be read. It may be done, and is not changed."""
 
     @classmethod
     def of_error(cls, error: StoreError | OSError) -> CellState:
         """Return the state of a cell whose files can't be read, or are damaged."""
-        if isinstance(error, UnreadableError):
-            return cls("unknown", f"it can't be read now: {error}")
         if isinstance(error, OSError):
-            kind = "unknown" if is_transient(error) else "corrupt"
-            return cls(kind, f"{error.filename}: {error.strerror}")
-        return cls("corrupt", str(error))
+            unreadable, reason = is_transient(error), f"{error.filename}: {error.strerror}"
+        else:
+            unreadable, reason = isinstance(error, UnreadableError), str(error)
+        return cls("failed" if unreadable else "corrupt", reason, unreadable)
 
 
 @dataclass(frozen=True)
@@ -166,7 +167,7 @@ class CellFolder:
         """Hash every file of a finished cell, and decode its JSON.
 
         Returns:
-            A line for each file that is missing, damaged, has changed, can't be read now or does
+            A line for each file that is missing, damaged, has changed, can't be read or does
             not belong there; empty for an intact cell.
         """
         try:

@@ -62,7 +62,6 @@ _PENDING = {
     "unfinished": "begun and not done yet: it is being trained, or was stopped",
 }
 _MAX_MACHINE = 120
-_UNKNOWN_VARIANT = "a file could not be read when the sweep was planned: run the same sweep again"
 
 
 class ReportError(XrgsError):
@@ -331,8 +330,6 @@ def _without_cell(row: RecordedCell) -> dict[str, str]:
     """Return state and reason of a row that has no cell: it can't be trained, or not yet."""
     if row.error:
         return {"state": row.state or "failed", "reason": row.error}
-    if row.state == "unknown":
-        return {"state": "unknown", "reason": _UNKNOWN_VARIANT}
     return {"state": "pending", "reason": "not trained yet: it waits for another cell's count"}
 
 

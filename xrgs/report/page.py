@@ -355,9 +355,6 @@ def _warnings(sweep: Sweep) -> list[str]:
             f"Renders of another program: {others}. Their PNGs are scored, and compared with the"
             " cells of the lowest seed; time, Gaussians and memory are not known."
         )
-    unknown = sweep.cells.loc[sweep.cells["state"] == "unknown", "cell_id"].nunique()
-    if unknown:
-        warnings.append(f"{counted(unknown, 'cell')} can't be read now: run the report again.")
     warnings += _stale_warning(sweep)
     if why := why_no_table(sweep.cells["label"], sweep.cells["scene"]):
         warnings.append(why)
