@@ -178,7 +178,7 @@ def _look(words: _Words) -> _Found | None:
         XrgsError: There are too few photographs, or too few are placed.
     """
     from xrgs.capture.description import mixture
-    from xrgs.report.joined import JoinedStore
+    from xrgs.report.joined import ReportStore
     from xrgs.sweep import variants
     from xrgs.sweep.estimate import read_views
 
@@ -198,7 +198,7 @@ def _look(words: _Words) -> _Found | None:
     if planned.id is None:
         _say("without --dry-run, their cameras are found, and a recipe is chosen for what they are")
         return None
-    report = JoinedStore((store,)).variant_report(planned.id)
+    report = ReportStore(store).variant_report(planned.id)
     found = mixture(read_views(store.variants, planned.id))
     _say(f"{name}: the cameras of {report.registered} of {report.images} {kind}s are found")
     _say(
