@@ -138,6 +138,11 @@ def _reduce(
     return functools.reduce(combine, answers) if answers else None
 
 
+def _joined(hooks: list[Callable[..., list[str]]]) -> list[str]:
+    """Join the lists of all hooks."""
+    return [line for hook in hooks for line in hook()]
+
+
 #: How the components' answers become one, by the hook.
 _FOLDS: dict[str, Callable[..., Any]] = {
     "before_training": _call,
@@ -160,6 +165,7 @@ _FOLDS: dict[str, Callable[..., Any]] = {
     "on_gaussians_changed": _call,
     "bake": _call,
     "after_training": _call,
+    "findings": _joined,
 }
 
 
