@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from statistics import fmean
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from xrgs.config import Conf
     from xrgs.experiment.cell_folder import CellFolder
     from xrgs.experiment.schema import Identity, Provenance, RecordedCell, Status, Summary
+    from xrgs.experiment.store import Store
 
 #: What a sweep's record says of each cell.
 RECORD_KEYS = [
@@ -130,20 +131,13 @@ class Sweep:
         return {key: sorted(values) for key, values in sorted(distinct.items())}
 
 
-class CellSource(Protocol):
-    """Where the cells of a sweep are: a store, or several."""
-
-    def cell(self, cell_id: str) -> CellFolder:
-        """Return the folder of a cell, which need not exist."""
-
-
 def read_cells(
-    store: CellSource, commands: Mapping[str, tuple[str, ...]], rows: Sequence[RecordedCell]
+    store: Store, commands: Mapping[str, tuple[str, ...]], rows: Sequence[RecordedCell]
 ) -> Sweep:
     """Read every cell that rows of records name.
 
     Args:
-        store: Where the cells are.
+        store: The store that has the cells.
         commands: The arguments of `xrgs-sweep` by the ids of the sweeps that the rows are from.
         rows: The rows.
 

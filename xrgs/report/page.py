@@ -148,7 +148,7 @@ def build(
     ids = tuple(dict.fromkeys(named or (store.store.latest_sweep(),)))
     commands, rows = store.sweep_records(ids)
     base = _base(rows, against)
-    sweep = read_cells(store, commands, choice.rows(rows, base))
+    sweep = read_cells(store.store, commands, choice.rows(rows, base))
     sweep = with_variants(sweep, store)
     sweep = with_external(sweep, store, externals)
     store = replace(store, external=sweep.renders)
