@@ -197,5 +197,6 @@ def test_the_pixels_of_a_cell_are_those_of_the_views_that_it_draws(
 
     estimate.read_views.cache_clear()
     monkeypatch.setattr(frozen, "read_manifest", read)
-    found = estimate._pixels(tmp_path, "k-1", compose(*overrides))
-    assert found == (pytest.approx(mean), LR if "lr_only" in str(overrides) else HR)
+    drawn, largest = estimate._pixels(tmp_path, "k-1", compose(*overrides))
+    assert drawn == pytest.approx(mean)
+    assert largest == (LR if "lr_only" in str(overrides) else HR)
