@@ -385,7 +385,10 @@ def test_an_archive_that_breaks_off_is_refused(
 
 def test_what_is_no_store_is_refused(mine: Store, tmp_path: Path) -> None:
     (tmp_path / "folder" / "photographs").mkdir(parents=True)
-    for source in (tmp_path / "folder", archive_of(tmp_path, ("x/y", b"1"))):
+    for members in ((), (("x/y", b"1"),)):
+        with pytest.raises(StoreError, match="not a store: it has no folder variants, scenes, "):
+            import_store(archive_of(tmp_path, *members), mine)
+    for source in (tmp_path / "folder", tmp_path / "folder" / "photographs"):
         with pytest.raises(StoreError, match="not a store: it has no folder variants, scenes, "):
             import_store(source, mine)
 

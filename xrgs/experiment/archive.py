@@ -34,6 +34,7 @@ from xrgs.experiment.schema import FileEntry, SweepRecord
 from xrgs.experiment.store import MAX_RECORD_BYTES
 from xrgs.runtime import lease
 from xrgs.runtime.progress import progress
+from xrgs.runtime.text import listed
 from xrgs.safeio.atomic import atomic_writer, json_text
 from xrgs.safeio.files import is_inside, is_name, remove_path, sync_name, sync_tree, walk_files
 from xrgs.safeio.hashing import digest
@@ -265,6 +266,7 @@ def _root(source: Path, unpacked: Path) -> Path:
     """Return the folder of the source that has `cells`; an archive is unpacked first."""
     folder = source
     if not source.is_dir():
+        unpacked.mkdir()
         _unpack(source, unpacked)
         folder = unpacked
     with errors_named(source):
@@ -348,8 +350,8 @@ class _Import:
                 continue
             count[kind] += copied
             present += not copied
-        lines = [for_line(f"{', '.join(names)}: {why}") for why, names in self.left_out.items()]
-        return Imported(**count, present=present, left_out=tuple(lines))
+        lines = (f"{listed(names)}: {why}" for why, names in self.left_out.items())
+        return Imported(**count, present=present, left_out=tuple(map(for_line, lines)))
 
     def _check(self, item: Path) -> None:
         kind = item.parent.name

@@ -129,8 +129,8 @@ class RecordedCell(Struct, frozen=True):
     error: str | None = None
     """Why the cell can't be trained."""
     state: Literal["unknown", "not placed"] | None = None
-    """`not placed` where SfM has placed too few photographs of its scene. Version 0.1.0 also wrote
-    `unknown`."""
+    """`not placed` where SfM has placed too few photographs of its scene. Earlier versions also
+    wrote `unknown`."""
 
 
 class SweepRecord(Struct, frozen=True):
