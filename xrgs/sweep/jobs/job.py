@@ -17,7 +17,6 @@ from xrgs.experiment.identity import changed_code
 from xrgs.runtime import lease
 from xrgs.runtime.machine import gpus
 from xrgs.runtime.progress import log_line
-from xrgs.safeio.files import is_transient
 from xrgs.splat.backend import arithmetic
 from xrgs.sweep import variants
 from xrgs.sweep.jobs import worker
@@ -100,18 +99,12 @@ def run_job(session: SweepSession, store: Store, cell_id: str, name: str) -> str
 
 
 def _outcome_of(error: OSError | StoreError, store: Store) -> str:
-    """Return the outcome of a job after an error of the store; raise any other error again."""
+    """Return the outcome of a job after an OSError; raise an error of a damaged file again."""
     if store.is_gone:
         return GONE
-    if isinstance(error, UnreadableError):
-        return "failed"
-    if isinstance(error, StoreError):
+    if isinstance(error, StoreError) and not isinstance(error, UnreadableError):
         raise error
-    if worker.unwritable(error):
-        return UNWRITABLE
-    if not is_transient(error):
-        raise error
-    return "failed"
+    return UNWRITABLE if isinstance(error, OSError) and worker.unwritable(error) else "failed"
 
 
 def _run_under_lease(
