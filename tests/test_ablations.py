@@ -5,25 +5,27 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import pytest
-from omegaconf import OmegaConf
 
 from xrgs.config import CONF_DIR, Conf
 from xrgs.store import identity
 from xrgs.sweep.axes import expand
 
 ABLATIONS = sorted({path.stem for path in (CONF_DIR / "ablation").glob("*.yaml")} - {"baseline"})
-SWEEPS = CONF_DIR / "sweeps" if (CONF_DIR / "sweeps").is_dir() else CONF_DIR.parent / "sweeps"
-#: The ablation whose value each sweep of sensitivity varies, and the number of values beside it.
+STUDY = Path(__file__).parents[1] / "docs" / "study.md"
+#: The ablation that has one of the values of each setting in the table of docs/study.md.
 SENSITIVITY = {
-    "consistency": ("consistency", 4),
-    "decide": ("densify", 2),
-    "densify": ("densify", 8),
-    "loss_weight": ("loss_weighting", 3),
-    "render_scale": ("render_scale", 3),
-    "scale_gradient": ("gradient_scaling", 3),
+    "components.consistency.weight=0.05,0.1,0.2,0.5,1": "consistency",
+    "components.densify.decide=current_view,per_class,own_threshold": "densify",
+    "components.densify.lr_grow=1,2,4 components.densify.lr_prune=1,2,4 +ablation=densify": (
+        "densify"
+    ),
+    "components.loss_weighting.lr_weight=0.1,0.25,0.5,0.75": "loss_weighting",
+    "components.render_scale.gamma=0.1,0.25,0.5,1": "render_scale",
+    "components.gradient_scaling.lr_scale=0.1,0.3,0.5,0.75": "gradient_scaling",
 }
 
 Compose = Callable[..., Conf]
@@ -100,23 +102,19 @@ def test_ablations_can_be_combined(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", SENSITIVITY)
+@pytest.mark.parametrize("words", SENSITIVITY)
 def test_a_sweep_of_sensitivity_varies_one_ablation_around_its_value(
-    name: str, composed: Compose
+    words: str, composed: Compose
 ) -> None:
-    params = OmegaConf.load(SWEEPS / f"sensitivity_{name}.yaml").hydra.sweeper.params
-    axes = [f"{key}={value}" for key, value in params.items() if key not in {"scene", "seed"}]
+    page, axes, count = STUDY.read_text(), words.split(), 1
+    for key, _, values in (axis.partition("=") for axis in axes):
+        assert f"`{key}" in page
+        assert f"`{values}`" in page or f"`{key}={values}`" in page
+        count *= len(values.split(","))
     cells = [composed(*spec.overrides) for spec in expand(axes) if spec.changes]
-    around, others = SENSITIVITY[name]
-    equal = [f"components.densify.lr_{key}=1" for key in ("grow", "prune") if name == "decide"]
-    expected = composed(f"+ablation={around}", *equal)
+    equal = [f"components.densify.lr_{name}=1" for name in ("grow", "prune") if "decide" in words]
+    expected = composed(f"+ablation={SENSITIVITY[words]}", *equal)
     assert sum(cell == expected for cell in cells) == 1
-    assert len({cell_id(cell) for cell in cells}) == len(cells) == others + 1
+    assert len({cell_id(cell) for cell in cells}) == len(cells) == count
     changed = {key.split(".")[1] for cell in cells for key in delta(cell, composed())}
     assert len(changed) == 1, "one component"
-
-
-def test_every_sweep_of_sensitivity_is_tested() -> None:
-    assert {f"sensitivity_{name}" for name in SENSITIVITY} == {
-        file.stem for file in SWEEPS.glob("sensitivity_*.yaml")
-    }

@@ -471,16 +471,7 @@ def test_a_cell_that_cannot_be_read_now_is_a_row_with_the_reason(
     monkeypatch.setattr(records, "read_bytes", failing)
     made.write()
     report = build(made.store.path, pictures=[])
-    assert "1 cell can't be read now: run the report again" in report.text
-    (row,) = [line for line in report.text.splitlines() if "unknown" in line]
+    (row,) = [line for line in report.text.splitlines() if "summary.json" in line]
+    assert "failed" in row
     assert "summary.json: " in row
     assert os.strerror(errno.EIO) in row
-
-
-def test_a_sweep_that_could_not_read_a_variant_says_so(made: Any) -> None:
-    made.add()
-    row = made.rows[0] | {"label": "consistency", "state": "unknown"}
-    made.rows.append(row | dict.fromkeys(("cell_id", "variant_id", "baseline_id")))
-    made.write()
-    text = build(made.store.path, pictures=[]).text
-    assert "unknown  a file could not be read when the sweep was planned" in text

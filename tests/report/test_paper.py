@@ -15,7 +15,7 @@ from scipy.stats import spearmanr
 from xrgs.evaluation.metrics import METRICS
 from xrgs.report.compare import compare
 from xrgs.report.context import Context
-from xrgs.report.joined import JoinedStore
+from xrgs.report.joined import ReportStore
 from xrgs.report.page import build
 from xrgs.report.paper import paper_tables, texture, texture_tables, why_no_table, with_texture
 from xrgs.runtime.text import TextTable
@@ -164,7 +164,7 @@ def add_scenes(made: Any, scenes: tuple[str, ...] = BY_TEXTURE) -> None:
 
 def tables_by_texture(made: Any) -> list[TextTable]:
     sweep = made.read()
-    views = with_texture(JoinedStore((made.store,)), sweep.cells, sweep.views)
+    views = with_texture(ReportStore(made.store), sweep.cells, sweep.views)
     return texture_tables(compare(sweep.cells, METRICS), views, TEXTURE_CONTEXTS)
 
 

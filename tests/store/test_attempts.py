@@ -142,9 +142,9 @@ def test_what_a_killed_process_left_of_other_attempts_is_used_or_removed(
 def test_a_cell_that_can_not_be_read_now_is_not_begun(
     done: CellFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    unknown = CellState("unknown", "it can't be read now: Input/output error")
-    monkeypatch.setattr(CellFolder, "state", lambda _: unknown)
-    with pytest.raises(UnreadableError, match="abc: it can't be read now: Input/output error"):
+    failed = CellState("failed", "status.json: Input/output error", unreadable=True)
+    monkeypatch.setattr(CellFolder, "state", lambda _: failed)
+    with pytest.raises(UnreadableError, match=r"abc: status\.json: Input/output error"):
         begin_attempt(done)
     assert list_names(done.path.parent) == ["abc"]
     assert done.status_file.exists()

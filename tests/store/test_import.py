@@ -8,7 +8,6 @@ import os
 import re
 import shutil
 import tarfile
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -78,7 +77,7 @@ def test_a_store_is_imported_whole(foreign: Store, mine: Store, kind: str) -> No
     cell = the_cell(foreign)
     expected = contents(foreign)
     del expected[f"cells/{cell.id}/log.txt"]
-    for name in ("checkpoint.npz", "progress.json", ".config.json.1-ab"):
+    for name in ("checkpoint.npz", "progress.json"):
         (cell.path / name).write_text("not imported")
     for name in ("hydra/a/b.yaml", "reports/x/report.html", "locks/a.0", "cells/a.aside-1/log.txt"):
         (foreign.path / name).parent.mkdir(parents=True, exist_ok=True)
@@ -138,20 +137,9 @@ def pipe(file: Path) -> str:
     return "not a regular file"
 
 
-def hard_link(file: Path) -> str:
-    """In an archive, the second name of a file is a link to the first."""
-    os.link(file, file.with_name(".first"))
-    return "not a regular file"
-
-
 def remove(file: Path) -> str:
     file.unlink()
     return "No such file"
-
-
-def sparse(file: Path) -> str:
-    os.truncate(file, 1 << 35)
-    return f"{1 << 35} bytes, at most"
 
 
 def change(file: Path) -> str:
@@ -161,17 +149,13 @@ def change(file: Path) -> str:
 
 
 @pytest.mark.parametrize("name", ["scores.csv", "splats.ply", "renders/a.png", "identity.json"])
-@pytest.mark.parametrize("attack", [link, pipe, hard_link, remove, sparse, change])
+@pytest.mark.parametrize("attack", [link, pipe, remove, change])
 def test_a_cell_with_another_file_is_left_out(
     foreign: Store, mine: Store, name: str, attack: Callable[[Path], str]
 ) -> None:
     cell = the_cell(foreign)
-    why, source = attack(cell.path / name), foreign.path
-    if attack is hard_link:
-        source = packed_as(foreign, foreign.path.parent / "a.tar", "w")
-    began = time.monotonic()
-    found = import_store(source, mine)
-    assert time.monotonic() - began < 20
+    why = attack(cell.path / name)
+    found = import_store(foreign.path, mine)
     assert (found.cells, found.variants, found.scenes, found.sweeps) == (0, 1, 1, 1)
     (line,) = found.left_out
     assert line.startswith(f"cells/{cell.id}: ")
@@ -259,9 +243,10 @@ def test_files_that_a_cell_does_not_list_are_not_admitted(foreign: Store, mine: 
     cell = the_cell(foreign)
     (cell.path / "renders" / "c.png").write_bytes(b"more")
     (cell.path / "extra.py").write_text("more")
-    names, unlisted = import_store(foreign.path, mine).left_out
-    assert names == f"cells/{cell.id}/extra.py: no store has a file of this name"
-    assert "renders/c.png: it does not belong there" in unlisted
+    (line,) = import_store(foreign.path, mine).left_out
+    assert "extra.py: it does not belong there" in line
+    assert "renders/c.png: it does not belong there" in line
+    assert list_names(mine.cells_folder) == []
 
 
 def change_manifest(store: Store, **changes: Any) -> None:
@@ -338,27 +323,23 @@ def archive_of(folder: Path, *members: tuple[tarfile.TarInfo | str, bytes]) -> P
 
 @pytest.mark.parametrize(
     "name",
-    [
-        *(
-            "/etc/passwd",
-            "../x",
-            "cells/../../x",
-            "cells//x",
-            "a\\b",
-            "x\x1b[2J",
-            "cells/" + "x" * 300,
-        ),
-        *("cells/0123456789abcdef/../../x", "cells/0123456789ABCDEF/status.json", "x", "cells/x/y"),
-        *("cells/0123456789abcdef/run.py", "sweeps/../x.json", "variants/x/variant.json"),
-    ],
+    ["cells/x/y", "cells/0123456789ABCDEF/status.json", "variants/x/variant.json", "sweeps/x.json"],
 )
 def test_a_name_that_no_store_has_is_left_out(mine: Store, tmp_path: Path, name: str) -> None:
-    source = archive_of(tmp_path, (name, b"{}"))
+    (line,) = import_store(archive_of(tmp_path, (name, b"{}")), mine).left_out
+    kind, inside, *_ = name.split("/")
+    assert line == f"{kind}/{inside}: no store has anything of this name"
+    assert contents(mine) == {}
+
+
+@pytest.mark.parametrize("name", ["../x", "cells/../../x", "cells/0123456789abcdef/../../../x"])
+def test_an_archive_with_a_name_outside_its_folder_is_refused(
+    mine: Store, tmp_path: Path, name: str
+) -> None:
+    source = archive_of(tmp_path, ("cells/0123456789abcdef/status.json", b"{}"), (name, b"{}"))
     before = {path for path in tmp_path.rglob("*") if not path.is_relative_to(mine.path)}
-    found = import_store(source, mine)
-    (line,) = found.left_out
-    assert line.isprintable()
-    assert "a store" in line or "no store" in line
+    with pytest.raises(StoreError, match="outside the destination"):
+        import_store(source, mine)
     assert contents(mine) == {}
     assert {path for path in tmp_path.rglob("*") if not path.is_relative_to(mine.path)} == before
 
@@ -366,55 +347,15 @@ def test_a_name_that_no_store_has_is_left_out(mine: Store, tmp_path: Path, name:
 @pytest.mark.parametrize(
     "kind", [tarfile.SYMTYPE, tarfile.LNKTYPE, tarfile.CHRTYPE, tarfile.FIFOTYPE]
 )
-def test_links_and_devices_are_left_out(mine: Store, tmp_path: Path, kind: bytes) -> None:
-    members = []
-    for name in ("cells/0123456789abcdef/status.json", "cells", "cells/0123456789abcdef/renders"):
-        header = tarfile.TarInfo(name)
-        header.type, header.linkname = kind, "/etc/passwd"
-        members.append((header, b""))
-    found = import_store(archive_of(tmp_path, *members), mine)
-    named = [name for line in found.left_out for name in line.partition(": ")[0].split(", ")]
-    assert len(named) == 3
-    assert all("not a regular file" in line for line in found.left_out)
+@pytest.mark.parametrize("target", ["/etc/passwd", "cells/0123456789abcdef/config.json"])
+def test_an_archive_with_a_link_or_a_device_is_refused(
+    mine: Store, tmp_path: Path, kind: bytes, target: str
+) -> None:
+    header = tarfile.TarInfo("cells/0123456789abcdef/status.json")
+    header.type, header.linkname = kind, target
+    with pytest.raises(StoreError, match=r"a\.tar: not an archive of a store \("):
+        import_store(archive_of(tmp_path, (header, b"")), mine)
     assert contents(mine) == {}
-
-
-@pytest.mark.parametrize(
-    ("first", "second"), [("a", "a"), ("a", "A"), ("\u00e9", "e\u0301"), ("ß", "SS")]
-)
-def test_two_names_that_are_one_on_some_file_systems_are_refused(
-    mine: Store, tmp_path: Path, first: str, second: str
-) -> None:
-    names = [f"cells/0123456789abcdef/renders/{name}.png" for name in (first, second)]
-    found = import_store(archive_of(tmp_path, *((name, b"1") for name in names)), mine)
-    (line,) = found.left_out
-    assert "differs in case alone" in line
-
-
-def test_the_number_of_files_their_bytes_and_lines_are_bounded(
-    mine: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    source = archive_of(tmp_path, *((f"x{number}", b"1" * 100) for number in range(50)))
-    why = "no store has a file of this name"
-    assert import_store(source, mine).left_out == (f"x0, x1, x2 and 47 more: {why}",)
-    for bound, value in (("_MAX_FILES", 20), ("_MAX_IMPORT_BYTES", 2000)):
-        with monkeypatch.context() as patch:
-            patch.setattr(archive, bound, value)
-            lines = import_store(source, mine).left_out
-        assert lines[0] == f"x0, x1, x2 and 17 more: {why}"
-        assert len(lines) == 2
-        assert "the rest was not read" in lines[-1]
-    monkeypatch.setattr(archive, "_MAX_LINES", 1)
-    monkeypatch.setattr(archive, "_MAX_FILES", 20)
-    assert import_store(source, mine).left_out[1:] == ("and 1 more reasons",)
-
-
-def test_a_header_that_would_fill_the_memory_is_not_read(mine: Store, tmp_path: Path) -> None:
-    header = tarfile.TarInfo("x")
-    header.type, header.size = tarfile.GNUTYPE_LONGNAME, 1 << 36
-    (tmp_path / "a.tar").write_bytes(header.tobuf(tarfile.GNU_FORMAT) + bytes(10_000))
-    with pytest.raises(StoreError, match=r"a\.tar: not an archive of a store"):
-        import_store(tmp_path / "a.tar", mine)
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\3\4", b"x" * 2000, b"\x1f\x8b\x08", b"BZh9xxxx"])
@@ -430,60 +371,54 @@ def test_a_source_that_is_not_there_is_named(mine: Store, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("kind", ["", ":gz", ":xz"])
-def test_an_archive_that_breaks_off_gives_what_is_whole(
+def test_an_archive_that_breaks_off_is_refused(
     foreign: Store, mine: Store, tmp_path: Path, kind: str
 ) -> None:
     """The random bytes at its end do not fit into what was compressed before."""
     (foreign.path / "zzz").write_bytes(os.urandom(1 << 20))
-    source = tmp_path / "a.tar"
-    mode: Any = f"w{kind}"
-    with tarfile.open(source, mode) as stream:
-        for name in ("cells", "scenes", "sweeps", "variants", "zzz"):
-            stream.add(foreign.path / name, name)
+    source = packed_as(foreign, tmp_path / "a.tar", f"w{kind}")
     os.truncate(source, source.stat().st_size - 100_000)
-    found = import_store(source, mine)
-    assert (found.cells, found.variants, found.scenes, found.sweeps) == (1, 1, 1, 1)
-    assert any("the rest can't be read" in line for line in found.left_out)
+    with pytest.raises(StoreError, match=r"a\.tar: not an archive of a store \("):
+        import_store(source, mine)
+    assert contents(mine) == {}
 
 
-def test_times_are_kept_and_none_is_in_the_future(
-    foreign: Store, mine: Store, tmp_path: Path
-) -> None:
-    (sweep_id,) = foreign.sweep_ids()
-    file = foreign.sweeps / f"{sweep_id}.json"
-    for modified, expected in ((1e9, 1e9), (1e12, time.time())):
-        os.utime(file, (modified, modified))
-        import_store(foreign.path, Store(tmp_path / str(modified)))
-        kept = (tmp_path / str(modified) / "sweeps" / file.name).stat().st_mtime
-        assert kept == pytest.approx(expected, abs=60)
+def test_what_is_no_store_is_refused(mine: Store, tmp_path: Path) -> None:
+    (tmp_path / "folder" / "photographs").mkdir(parents=True)
+    for members in ((), (("x/y", b"1"),)):
+        with pytest.raises(StoreError, match="not a store: it has no folder variants, scenes, "):
+            import_store(archive_of(tmp_path, *members), mine)
+    for source in (tmp_path / "folder", tmp_path / "folder" / "photographs"):
+        with pytest.raises(StoreError, match="not a store: it has no folder variants, scenes, "):
+            import_store(source, mine)
 
 
 # Interruptions
 
 
-@pytest.mark.parametrize("name", ["_copy", "admit", "_name"])
+@pytest.mark.parametrize("name", ["_check", "copy_all", "_copy"])
 def test_a_stopped_import_shows_nothing_that_is_not_whole_and_goes_on(
     foreign: Store, mine: Store, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A kill leaves the hidden folders, and the lease of a process that is no more."""
-    real, calls = getattr(archive._Border, name), []
+    real, calls = getattr(archive._Import, name), []
 
     def killed(*arguments: Any) -> Any:
         calls.append(arguments)
-        if len(calls) == 2 or name == "admit":
+        if len(calls) == 2 or name == "copy_all":
             raise KeyboardInterrupt
         return real(*arguments)
 
     with monkeypatch.context() as patch:
-        patch.setattr(archive._Border, name, killed)
-        patch.setattr(archive._Border, "clear", lambda _: None)
+        patch.setattr(archive._Import, name, killed)
+        patch.setattr(archive._Import, "clear", lambda _: None)
         with pytest.raises(KeyboardInterrupt):
             import_store(foreign.path, mine)
     assert [cell.state().name for cell in mine.cell_folders()] in ([], ["done"])
     before = len([*mine.cell_folders(), *mine.sweep_ids()])
     shown = [*list_names(mine.variants), *list_names(mine.scenes)]
     before += len([name for name in shown if not name.startswith(".")])
-    assert before == (1 if name == "_name" else 0)
+    assert before == (1 if name in {"_check", "_copy"} else 0)
     assert import_store(foreign.path, mine).present == before
     expected = contents(foreign)
     assert contents(mine) == {k: v for k, v in expected.items() if not k.endswith("log.txt")}
@@ -494,13 +429,14 @@ def test_a_cell_that_a_sweep_begins_meanwhile_is_the_sweeps(
 ) -> None:
     cell = mine.cell(the_cell(foreign).id)
 
-    def begun(border: archive._Border) -> Imported:
-        cell.path.mkdir()
-        (cell.path / "log.txt").touch()
-        return real(border)
+    def begun(importing: archive._Import, item: Path) -> bool:
+        if item.name == cell.id:
+            cell.path.mkdir()
+            (cell.path / "log.txt").touch()
+        return real(importing, item)
 
-    real = archive._Border.admit
-    monkeypatch.setattr(archive._Border, "admit", begun)
+    real = archive._Import._copy
+    monkeypatch.setattr(archive._Import, "_copy", begun)
     assert import_store(foreign.path, mine) == Imported(0, 1, 1, 1, 1, ())
     assert list_names(cell.path) == ["log.txt"]
 
@@ -510,6 +446,6 @@ def test_the_command_says_what_was_imported_and_what_was_left_out(
 ) -> None:
     code, said, _ = call_command("store", "import", str(foreign.path), "--store", "mine")
     assert (code, said.count("imported: 1 cell, 1 variant, ")) == (0, 1)
-    (the_cell(foreign).path / "extra.py").touch()
+    (foreign.cells_folder / "extra").touch()
     code, said, _ = call_command("store", "import", str(foreign.path), "--store", "mine")
     assert (code, said.count("already there: 4")) == (1, 1)

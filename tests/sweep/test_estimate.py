@@ -22,8 +22,7 @@ from xrgs.store import provenance
 from xrgs.sweep import estimate
 from xrgs.sweep.estimate import TORCH_SLOWDOWN, Cost, CostEstimator
 
-#: The bytes that training holds of the photographs of each variant.
-HELD = {"v": 200_000_000, "large": 3_200_000_000}
+HR, LR = 200**2, 100**2
 START = datetime(2026, 1, 1, tzinfo=UTC)
 
 
@@ -45,7 +44,6 @@ class Past:
         conf: Conf | None = None,
         variant: str = "v",
         overhead: float = 0.0,
-        gaussians: int = 100_000,
         **made: Any,
     ) -> None:
         conf = conf or self.conf
@@ -58,7 +56,6 @@ class Past:
             cell.summary(),
             training_time_s=seconds,
             peak_rss_bytes=1e9,
-            gaussians=gaussians,
             steps=conf.train.steps,
         )
         write_json(cell.path / "summary.json", msgspec.to_builtins(summary))
@@ -81,12 +78,12 @@ def past(cells: Any, monkeypatch: pytest.MonkeyPatch) -> Past:
     made = Past(cells, {"v": 300, "large": 600})
     made.conf = made.train(steps=100)
 
-    def sizes(_: Path, variant: str, *__: Any) -> estimate._Sizes:
+    def pixels(_: Path, variant: str, __: Conf) -> tuple[float, int]:
         if variant not in made.sides:
             raise StoreError("damaged")
-        return estimate._Sizes(made.sides[variant] ** 2, made.sides[variant] ** 2, HELD[variant])
+        return made.sides[variant] ** 2, made.sides[variant] ** 2
 
-    monkeypatch.setattr(estimate, "_sizes", sizes)
+    monkeypatch.setattr(estimate, "_pixels", pixels)
     return made
 
 
@@ -125,33 +122,14 @@ def test_times_of_a_gpu_and_of_a_processor_say_nothing_about_each_other(
     assert past.cost().seconds == pytest.approx(100)
 
 
-def test_pixels_and_gaussians_scale_the_time_and_the_memory(past: Past) -> None:
-    past.add(100.0, gaussians=90_000)  # as many as a view has pixels
-    found = past.cost(variant="large")
-    assert found.seconds == pytest.approx(100 * (4 + 1) / 2)
-    # The photographs of that variant take 3 GB more, whatever the size of one.
-    assert found.memory_bytes == pytest.approx((1e9 - 2e8) * (4 + 1) / 2 + 32e8)
+def test_pixels_scale_time_memory_and_disk(past: Past) -> None:
+    past.add(100.0, overhead=5.0)
+    found, alike = past.cost(variant="large"), past.cost()
+    assert found.seconds == pytest.approx(4 * 105)
+    assert found.memory_bytes == pytest.approx(4e9)
+    assert found.disk_bytes == pytest.approx(4 * alike.disk_bytes)
     # Of a variant that is not built, or can't be read, the nearest known sizes are taken.
-    assert past.cost(variant=None) == past.cost(variant="unreadable") == past.cost()
-
-
-def test_a_budget_of_gaussians_limits_disk_and_time(past: Past) -> None:
-    past.add(100.0, gaussians=90_000)
-    densify = replace(past.conf.splat.densify, budget=0.25)
-    few = replace(past.conf, splat=replace(past.conf.splat, densify=densify))
-    found, free = past.cost(few), past.cost()
-    assert found.disk_bytes == pytest.approx(free.disk_bytes / 4)  # 22,500 of 90,000
-    assert found.seconds == pytest.approx(free.seconds * (1 + 0.25) / 2)
-
-
-def test_natural_selection_takes_gaussians_away_late(past: Past) -> None:
-    past.add(100.0, gaussians=90_000)
-    selection = replace(past.conf.components.natural_selection, budget=0.25)
-    components = replace(past.conf.components, natural_selection=selection)
-    found, free = past.cost(replace(past.conf, components=components)), past.cost()
-    assert found.disk_bytes == pytest.approx(free.disk_bytes / 4)
-    mean = (90_000 + 22_500) / 2
-    assert found.seconds == pytest.approx(free.seconds * (90_000 + mean) / (90_000 + 90_000))
+    assert past.cost(variant=None) == past.cost(variant="unreadable") == alike
 
 
 def test_the_median_of_equally_near_cells_counts(past: Past) -> None:
@@ -186,82 +164,39 @@ def test_damaged_cells_are_left_out(past: Past, spoilt: str) -> None:
     assert past.cost().seconds == pytest.approx(40)
 
 
-@pytest.fixture
-def sizes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[Conf], estimate._Sizes]:
-    """The sizes of a cell on a trimmed variant of two HR and two LR views."""
-    estimate.read_views.cache_clear()
-
-    def view(name: str, split: str, tag: str, side: int, need: float) -> SimpleNamespace:
-        size = {"width": side, "height": side}
-        return SimpleNamespace(name=name, split=split, tag=tag, supersampling=need, **size)
-
-    made = [
-        *(view(name, "train", "HR", 200, 1.2) for name in "ab"),
-        *(view(name, "train", "LR", 100, 4.8) for name in "cd"),
-        *(view(name, "original", "HR", 200, 1.2) for name in "cd"),
-        view("e", "test", "HR", 999, 1.0),
-    ]
-
-    def read(folder: Path) -> SimpleNamespace:
-        assert folder == tmp_path / "trimmed-k-1"
-        return SimpleNamespace(views=made)
-
-    monkeypatch.setattr(saved_variant, "read_manifest", read)
-    return lambda conf: estimate._sizes(tmp_path, "k-1", conf)
-
-
-HR, LR = 200**2, 100**2
-
-
 @pytest.mark.parametrize(
-    ("overrides", "pixels"),
+    ("overrides", "mean"),
     [
         ([], (HR + LR) / 2),
-        (["train.hr_share=0.5"], (HR + LR) / 2),
         (["train.hr_share=0.8"], 0.8 * HR + 0.2 * LR),
         (["train.views=hr_only"], HR),
         (["train.views=lr_only", "train.hr_share=0.8"], LR),
         (["train.views=all_hr"], HR),
-        # Two HR views are left at least.
-        (["train.validation=0.5"], (HR + LR) / 2),
-        # LR views need 5 times as many pixels a side, and get 3 times as many in half of the steps.
-        (
-            ["components.supersampled.factor=3", "components.supersampled.late_factor=1"],
-            (HR + LR * (9 + 1) / 2) / 2,
-        ),
-        # Of a digital zoom, LR views resolve a fifth of their size; at factor 1 they are whole.
-        (
-            ["components.supersampled.factor=2", "variant.degradation=digital_zoom"],
-            (HR + LR * ((2 / 5) ** 2 + 1) / 2) / 2,
-        ),
-        # HR views at 1/3 of their size in the first tenth of the steps, then 1/2 to a quarter.
-        (
-            ["components.resolution_schedule.start_share=0.4"],
-            (HR * (0.1 / 9 + 0.15 / 4 + 0.75) + LR) / 2,
-        ),
-        (["components.resolution_schedule.start_share=0"], (HR + LR) / 2),  # training refuses it
     ],
 )
-def test_a_step_renders_the_pixels_that_the_components_ask_for(
-    sizes: Callable[[Conf], estimate._Sizes],
+def test_the_pixels_of_a_cell_are_those_of_the_views_that_it_draws(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
     compose: Callable[..., Conf],
     overrides: list[str],
-    pixels: float,
+    mean: float,
 ) -> None:
-    assert sizes(compose(*overrides)).pixels == pytest.approx(pixels, rel=0.03)
+    def view(name: str, split: str, tag: str, side: int) -> SimpleNamespace:
+        return SimpleNamespace(name=name, split=split, tag=tag, width=side, height=side)
 
+    views = [
+        *(view(name, "train", "HR", 200) for name in "ab"),
+        *(view(name, "train", "LR", 100) for name in "cd"),
+        *(view(name, "original", "HR", 200) for name in "cd"),
+        view("e", "test", "HR", 999),
+    ]
 
-@pytest.mark.parametrize("views", ["mixed", "hr_only", "lr_only", "all_hr"])
-@pytest.mark.parametrize("kept", [500_000, 1 << 28])
-def test_the_photographs_that_training_holds_are_those_of_its_views(
-    monkeypatch: pytest.MonkeyPatch,
-    sizes: Callable[[Conf], estimate._Sizes],
-    compose: Callable[..., Conf],
-    views: str,
-    kept: int,
-) -> None:
-    monkeypatch.setattr(estimate, "KEPT_BYTES", kept)
-    found = sizes(compose(f"train.views={views}"))
-    assert found.largest == (LR if views == "lr_only" else HR)
-    trained = 2 * {"mixed": HR + LR, "hr_only": HR, "lr_only": LR, "all_hr": 2 * HR}[views]
-    assert found.held_bytes == 3 * (trained + 999**2) + min(kept, 24 * trained)
+    def read(folder: Path) -> SimpleNamespace:
+        assert folder == tmp_path / "trimmed-k-1"
+        return SimpleNamespace(views=views)
+
+    estimate.read_views.cache_clear()
+    monkeypatch.setattr(saved_variant, "read_manifest", read)
+    drawn, largest = estimate._pixels(tmp_path, "k-1", compose(*overrides))
+    assert drawn == pytest.approx(mean)
+    assert largest == (LR if "lr_only" in str(overrides) else HR)

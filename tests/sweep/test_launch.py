@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import pickle
 import shutil
 from collections.abc import Callable, Mapping, Sequence
@@ -26,7 +25,7 @@ from xrgs.store.identity import cell_id, cell_identity
 from xrgs.store.store import Store
 from xrgs.sweep import launch
 from xrgs.sweep.axes import CellSpec
-from xrgs.sweep.jobs.job import INTERRUPTED, UNKNOWN
+from xrgs.sweep.jobs.job import INTERRUPTED
 from xrgs.sweep.launch import LOST, Launches, capacity, one_cell_a_gpu
 from xrgs.sweep.plan import PlannedCell
 from xrgs.sweep.session import SweepSession
@@ -371,20 +370,6 @@ def test_a_cell_that_another_sweep_has_begun_since_the_plan_is_left_as_it_is(
     assert launch._hand_over(ours, 1, store)[0] == f"cell={cell.id}"
     assert cell.config().threads == 2
     assert cell.state().name == ("done" if how == "done" else "unfinished")
-
-
-def test_an_answer_that_is_lost_of_a_cell_that_can_not_be_read_blames_no_cell(
-    launch_cells: Callable[..., tuple[dict[str, str], FakeLauncher]],
-    sick: Callable[[str, int], None],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def answer(self: FakeLauncher, name: str) -> JobReturn:
-        sick("status.json", errno.EIO)
-        return JobReturn(status=JobStatus.FAILED, _return_value=RuntimeError("timed out"))
-
-    monkeypatch.setattr(FakeLauncher, "answer", answer)
-    outcomes, _ = launch_cells("a", set())
-    assert outcomes == {"a": UNKNOWN}
 
 
 def test_a_launcher_composes_nothing_for_a_job(

@@ -64,25 +64,11 @@ def configured(cell: PlannedCell, name: str) -> PlannedCell:
 def test_cells_that_are_done_running_or_tried_are_not_trained(
     cell: Callable[..., PlannedCell], retry: bool, failed: set[str]
 ) -> None:
-    names = ("absent", "corrupt", "done", "failed", "running", "unfinished", "unknown")
+    names = ("absent", "corrupt", "done", "failed", "running", "unfinished")
     plan = [cell(name, name) for name in names]
     assert set(ready(plan, (), retry=retry)) == failed | {"absent", "corrupt", "unfinished"}
     assert "absent" not in ready(plan, {"absent"}, retry=retry)
     assert not ready([replace(each, error="no variant") for each in plan], (), retry=retry)
-
-
-def test_an_unknown_cell_is_neither_to_train_nor_failed(
-    cell: Callable[..., PlannedCell],
-) -> None:
-    known = cell("a", "done", 5.0)
-    plan = [known, cell("b", "unknown", 50.0), replace(cell("c", "unknown", 50.0), cell_id=None)]
-    text = describe(plan)
-    assert text.splitlines()[0] == "plan: 3 cells, 1 done"
-    assert text.count("run the same command again") == text.count("(the same)") == 1
-    assert "variant unknown" in text
-    assert "failed" not in text
-    assert "~" not in text
-    assert without_kernels(plan) == ""
 
 
 def test_the_longest_cells_come_first_and_unknown_ones_before_them(

@@ -111,16 +111,16 @@ def test_a_cell_that_cannot_be_read_now_is_listed_with_the_reason(
 ) -> None:
     sick("status.json", number)
     found = read(intact.path)
-    assert {cell.state.name for cell in found.cells} == {"unknown"}
+    assert {cell.state.name for cell in found.cells} == {"failed"}
     text = describe(found)
-    assert "\nunknown:\n" in text
+    assert "\nfailed:\n" in text
     assert f"good/status.json: {os.strerror(number)}" in text
     cells = intact.cells()
-    assert set(cells["state"]) == {"unknown"}
+    assert set(cells["state"]) == {"failed"}
     assert cells["reason"].str.contains(os.strerror(number)).all()
 
 
-def test_a_cell_whose_disk_gives_no_answer_is_unknown_and_not_unfinished(
+def test_a_cell_whose_disk_gives_no_answer_is_not_unfinished(
     intact: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stat = Path.stat
@@ -131,7 +131,7 @@ def test_a_cell_whose_disk_gives_no_answer_is_unknown_and_not_unfinished(
         return stat(path, **given)
 
     monkeypatch.setattr(Path, "stat", failing)
-    assert {cell.state().name for cell in intact.cell_folders()} == {"unknown"}
+    assert all(cell.state().unreadable for cell in intact.cell_folders())
 
 
 @pytest.mark.parametrize("folder", ["cells", "sweeps", "variants", "locks"])

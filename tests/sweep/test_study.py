@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import os
 import shutil
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -255,7 +254,7 @@ def planned(
     return store, trainer, plan
 
 
-def test_a_cell_that_can_not_be_read_is_left_alone_and_the_others_are_trained(
+def test_a_cell_that_can_not_be_read_fails_and_the_others_are_trained(
     planned: tuple[Store, Trainer, list[PlannedCell]],
     study: Callable[..., Study],
     sick: Callable[[str, int], None],
@@ -269,70 +268,14 @@ def test_a_cell_that_can_not_be_read_is_left_alone_and_the_others_are_trained(
         plan = made._identified(plan, store)
         final = made._run_until_complete(plan, store, [monitor])
     assert trainer.launched == [plan[1].cell_id]
-    assert [cell.state.name for cell in final] == ["unknown", "done"]
+    assert [cell.state.name for cell in final] == ["failed", "done"]
     text = describe(final)
     assert f"{plan[0].cell_id}/status.json: {os.strerror(errno.EIO)}" in text
-    assert "can't be read now" in text
-    assert "; run the same command again)" in text
-    assert "failed" not in text
+    assert "retry=failed" in text
     assert [row.error for row in record(final)] == [None, None]
     sick("", 0)
     assert files(store.cell(str(plan[0].cell_id)).path) == before
-    assert "1 of 2 cells done" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("looks", [1, study_module._UNKNOWN_LOOKS, 100])
-def test_an_error_that_passes_is_waited_for_a_while(
-    planned: tuple[Store, Trainer, list[PlannedCell]],
-    study: Callable[..., Study],
-    sick: Callable[[str, int], None],
-    monkeypatch: pytest.MonkeyPatch,
-    looks: int,
-) -> None:
-    store, trainer, plan = planned
-    sick(f"{plan[0].cell_id}/status.json", errno.ESTALE)
-    slept = []
-
-    def sleep(seconds: float) -> None:
-        slept.append(seconds)
-        if len(slept) == looks:
-            sick("", 0)
-
-    made = study("store=s")
-    plan = made._identified(plan, store)
-    finish(store, str(plan[1].cell_id))
-    monkeypatch.setattr(study_module, "_POLL_S", 2.0)
-    monkeypatch.setattr(time, "sleep", sleep)
-    final = made._run_until_complete(plan[:1], store, [SweepMonitor(store.cells_folder)])
-    passes = looks < study_module._UNKNOWN_LOOKS
-    assert final[0].state.name == ("done" if passes else "unknown")
-    assert slept == [2.0] * min(looks + 1, study_module._UNKNOWN_LOOKS)
-    assert not trainer.launched
-
-
-def test_a_variant_that_can_not_be_read_makes_its_cells_unknown_until_it_can(
-    planned: tuple[Store, Trainer, list[PlannedCell]],
-    study: Callable[..., Study],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    store, trainer, plan = planned
-    found = [build_variants.PlannedVariant(unknown="its variant can't be read now: points.npz")]
-    monkeypatch.setattr(build_variants, "plan", lambda confs, *_, **__: found[-1:] * len(confs))
-    made = study("store=s")
-    plan = [replace(cell, variant_id=None, identity=None, cell_id=None) for cell in plan]
-    plan = made._identified(made._with_variants(plan, store, allow_build=True), store)
-    monitor = SweepMonitor(store.cells_folder)
-    final = made._run_until_complete(plan, store, [monitor])
-    assert not trainer.launched
-    assert [cell.state.name for cell in final] == ["unknown"] * 2
-    assert "variant unknown" in describe(final)
-    assert {(row.state, row.error) for row in record(final)} == {
-        ("unknown", "its variant can't be read now: points.npz")
-    }
-    found.append(build_variants.PlannedVariant("v"))
-    final = made._run_until_complete(plan, store, [monitor])
-    assert [cell.state.name for cell in final] == ["done"] * 2
-    assert len(trainer.launched) == 1
+    assert "1 of 2 cells done, 1 failed" in capsys.readouterr().err
 
 
 def test_the_notes_of_a_variant_are_said_once_for_all_of_its_cells(
@@ -350,7 +293,7 @@ def test_the_notes_of_a_variant_are_said_once_for_all_of_its_cells(
     assert capsys.readouterr().err == said
 
 
-def test_a_count_that_can_not_be_read_is_unknown(
+def test_a_count_that_can_not_be_read_fails_the_cell(
     planned: tuple[Store, Trainer, list[PlannedCell]],
     study: Callable[..., Study],
     sick: Callable[[str, int], None],
@@ -363,8 +306,7 @@ def test_a_count_that_can_not_be_read_is_unknown(
     done = replace(reference, state=store.cell(str(reference.cell_id)).state())
     sick("summary.json", errno.EIO)
     waiting = study("store=s")._with_count(cell, {cell.reference: done}, store)
-    assert waiting.unknown
-    assert "summary.json" in waiting.state.reason
+    assert "summary.json" in str(waiting.error)
     assert waiting.conf == cell.conf
 
 

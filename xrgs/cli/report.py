@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from tyro.conf import arg
 
 from xrgs.cli import options
 from xrgs.cli.options import STORE, Folder, Names, OptionalFolder, shown_as
-from xrgs.errors import StoreError
 from xrgs.runtime.streams import say
 from xrgs.store.store import BASELINE, Store
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 _DESCRIPTION = """\
 Make the tables and figures of a sweep from a store alone; the same store gives the same bytes.
@@ -24,7 +19,7 @@ The report of a sweep that runs or was stopped has the cells that are done."""
 
 
 def report(
-    store: Annotated[tuple[Path, ...], arg(metavar="FOLDER ...")] = (STORE,),
+    store: Folder = STORE,
     sweep: Annotated[tuple[str, ...], shown_as("ID ...")] = (),
     scenes: Names = (),
     ablations: Names = (),
@@ -40,13 +35,12 @@ def report(
     """Make the tables and figures of a sweep.
 
     Args:
-        store: The store. With several, a cell is looked for in each.
+        store: The store.
         sweep: The sweep: its id, the beginning of it, or the name of a scene for the latest sweep
-            of it. Several are joined, for example one of each scene. By default the latest, and
-            with several stores the latest of each.
+            of it. Several are joined, for example one of each scene. By default the latest.
         scenes: The scenes in the report; all by default.
         ablations: The ablations in the report, beside what they are compared with; all by default.
-        out: Folder to write to. By default reports/ID in the first store; with a choice
+        out: Folder to write to. By default reports/ID in the store; with a choice
             reports/ID.scenes-NAMES or reports/ID.ablations-NAMES, and with another label to compare
             with reports/ID.against-LABEL.
         pictures: `all`, `none`, or names of figures without their ending, such as `trade-off` or
@@ -70,23 +64,8 @@ def report(
     choice = Choice(scenes, ablations)
     design = Design(outcomes or Design.outcomes, headline, margin_psnr, margin_lpips)
     others = parse(external)
-    ids = [find_sweep([Store(path) for path in store], word) for word in sweep]
-    say(build(list(store), ids or None, out, drawn, against, choice, others, design).text)
-
-
-def find_sweep(stores: Sequence[Store], word: str) -> str:
-    """Return the id of the sweep that a word names in the first of the stores that has one.
-
-    Raises:
-        StoreError: None has; the message is the first store's.
-    """
-    errors = []
-    for store in stores:
-        try:
-            return store.find_sweep(word)
-        except StoreError as error:
-            errors.append(error)
-    raise errors[0]
+    ids = [Store(store).find_sweep(word) for word in sweep]
+    say(build(store, ids or None, out, drawn, against, choice, others, design).text)
 
 
 def list_sweeps(store: Folder = STORE) -> None:

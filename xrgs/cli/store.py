@@ -35,7 +35,7 @@ class Filter:
     ablations: Names = ()
     """Only cells of these ablations."""
     states: Names = ()
-    """Only cells in these states: done, running, planned, unfinished, failed, corrupt, unknown."""
+    """Only cells in these states: done, running, planned, unfinished, failed, corrupt."""
     sweep: Annotated[tuple[str, ...], shown_as("ID ...")] = ()
     """Only cells of these sweeps; xrgs-report list has the ids."""
     older_days: Annotated[float, shown_as("DAYS")] = 0.0

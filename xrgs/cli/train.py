@@ -177,7 +177,7 @@ def _look(words: _Words) -> _Found | None:
     Raises:
         XrgsError: There are too few photographs, or too few are placed.
     """
-    from xrgs.report.joined import JoinedStore
+    from xrgs.report.joined import ReportStore
     from xrgs.store.inspect import mixture
     from xrgs.sweep import build_variants
     from xrgs.sweep.estimate import read_views
@@ -190,15 +190,15 @@ def _look(words: _Words) -> _Found | None:
     if not conf.dry_run:
         store.prepare()
     (planned,) = build_variants.plan([conf], store, allow_build=not conf.dry_run)
-    if planned.error or planned.unknown:
-        raise XrgsError(planned.error or f"{planned.unknown}; run the same command again")
+    if planned.error:
+        raise XrgsError(planned.error)
     for note in planned.notes:
         if not note.startswith(_FOR_STUDIES):
             _say(f"  {note}")
     if planned.id is None:
         _say("without --dry-run, their cameras are found, and a recipe is chosen for what they are")
         return None
-    report = JoinedStore((store,)).variant_report(planned.id)
+    report = ReportStore(store).variant_report(planned.id)
     found = mixture(read_views(store.variants, planned.id))
     _say(f"{name}: the cameras of {report.registered} of {report.images} {kind}s are found")
     _say(

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from statistics import fmean
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from xrgs.store.cell_folder import CellFolder
     from xrgs.store.inspect import SfmReport
     from xrgs.store.schema import Identity, Provenance, RecordedCell, Status, Summary
+    from xrgs.store.store import Store
 
 #: What a sweep's record says of each cell.
 RECORD_KEYS = [
@@ -62,7 +63,6 @@ _PENDING = {
     "unfinished": "begun and not done yet: it is being trained, or was stopped",
 }
 _MAX_MACHINE = 120
-_UNKNOWN_VARIANT = "a file could not be read when the sweep was planned: run the same sweep again"
 
 
 class ReportError(XrgsError):
@@ -131,20 +131,13 @@ class Sweep:
         return {key: sorted(values) for key, values in sorted(distinct.items())}
 
 
-class CellSource(Protocol):
-    """Where the cells of a sweep are: a store, or several."""
-
-    def cell(self, cell_id: str) -> CellFolder:
-        """Return the folder of a cell, which need not exist."""
-
-
 def read_cells(
-    store: CellSource, commands: Mapping[str, tuple[str, ...]], rows: Sequence[RecordedCell]
+    store: Store, commands: Mapping[str, tuple[str, ...]], rows: Sequence[RecordedCell]
 ) -> Sweep:
     """Read every cell that rows of records name.
 
     Args:
-        store: Where the cells are.
+        store: The store that has the cells.
         commands: The arguments of `xrgs-sweep` by the ids of the sweeps that the rows are from.
         rows: The rows.
 
@@ -331,8 +324,6 @@ def _without_cell(row: RecordedCell) -> dict[str, str]:
     """Return state and reason of a row that has no cell: it can't be trained, or not yet."""
     if row.error:
         return {"state": row.state or "failed", "reason": row.error}
-    if row.state == "unknown":
-        return {"state": "unknown", "reason": _UNKNOWN_VARIANT}
     return {"state": "pending", "reason": "not trained yet: it waits for another cell's count"}
 
 

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from xrgs.mixture.views import View
-    from xrgs.report.joined import JoinedStore
+    from xrgs.report.joined import ReportStore
 
 #: Another program's renders become one row for each combination of these.
 _VARIANT = ["scene", "condition", "variant_seed"]
@@ -89,7 +89,7 @@ def parse(words: Sequence[str]) -> tuple[External, ...]:
     return tuple(found)
 
 
-def with_external(sweep: Sweep, store: JoinedStore, externals: Sequence[External]) -> Sweep:
+def with_external(sweep: Sweep, store: ReportStore, externals: Sequence[External]) -> Sweep:
     """Return a sweep with a row for each variant that another program has rendered.
 
     A program has one set of renders for a variant. They are paired with the cells of the lowest
@@ -119,7 +119,7 @@ def with_external(sweep: Sweep, store: JoinedStore, externals: Sequence[External
     return sweep
 
 
-def _with_one(sweep: Sweep, store: JoinedStore, one: External) -> Sweep:
+def _with_one(sweep: Sweep, store: ReportStore, one: External) -> Sweep:
     done = sweep.cells[sweep.cells["state"] == "done"].sort_values("seed", kind="stable")
     done = done[~done["cell_id"].isin(sweep.renders)]
     rows: list[dict[str, Any]] = []
@@ -184,7 +184,7 @@ def _figures(folder: Path) -> dict[str, float | None]:
     return msgspec.structs.asdict(read_struct(file, Figures) if file.exists() else Figures())
 
 
-def _expected(store: JoinedStore, variant_id: str, split: str) -> dict[str, View]:
+def _expected(store: ReportStore, variant_id: str, split: str) -> dict[str, View]:
     """Return the views of a variant that cells are scored on, by name."""
     frozen = variant.load(store.variant(variant_id))
     return {view.name: view for view in frozen.views if view.split == split}

@@ -1,16 +1,15 @@
-"""Reads several stores and several sweeps as one, and chooses rows of them, for one report.
+"""Joins the records of several sweeps of a store, and chooses rows of them, for one report.
 
-A study may be trained in parts: scene by scene, on two machines, each into a store of its own. Its
-report needs the rows of all records, and finds each cell in the store where it is done.
+A study may be trained in parts, for example scene by scene. Its report needs the rows of all
+records. A store from another machine comes in through `xrgs-store import`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
-from xrgs.errors import StoreError
 from xrgs.mixture.paths import trimmed_folder
 from xrgs.report.collect import ReportError
 from xrgs.safeio.sanitize import for_file_name
@@ -18,14 +17,13 @@ from xrgs.store.inspect import read_report
 from xrgs.store.store import BASELINE
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from xrgs.store.cell_folder import CellFolder
     from xrgs.store.inspect import SfmReport
-    from xrgs.store.schema import RecordedCell, SweepRecord
+    from xrgs.store.schema import RecordedCell
     from xrgs.store.store import Store
 
-_T = TypeVar("_T")
 #: The most ids that the name of a report lists.
 _MAX_LISTED = 4
 
@@ -77,42 +75,37 @@ def _check_known(key: str, wanted: Iterable[str], known: Sequence[str]) -> None:
 
 
 @dataclass(frozen=True)
-class JoinedStore:
-    """One or several stores from which a report is made; nothing is written through it."""
+class ReportStore:
+    """The store from which a report is made, with renders of other programs."""
 
-    stores: tuple[Store, ...]
-    """The stores; of a cell that several have done, the first counts."""
+    store: Store
     external: Mapping[str, Path] = field(default_factory=dict)
     """Folders of renders that another program made, `Sweep.renders`."""
 
     def cell(self, cell_id: str) -> CellFolder:
-        """Return the folder of a cell, in the store where it is done if there is one.
+        """Return the folder of a cell, which need not exist.
 
         Raises:
             StoreError: The id is not a valid name of a folder.
         """
-        return _first([store.cell(cell_id) for store in self.stores], _is_done, _is_there)
+        return self.store.cell(cell_id)
 
     def variant(self, variant_id: str) -> Path:
-        """Return the folder of a variant, in a store that has it if there is one.
+        """Return the folder of a variant, which need not exist.
 
         Raises:
             StoreError: The id is not a valid name of a folder.
         """
-        return _first([store.variant(variant_id) for store in self.stores], Path.is_dir)
+        return self.store.variant(variant_id)
 
     def variant_report(self, variant_id: str) -> SfmReport:
         """Read how a variant was made, also where its images were removed on purpose.
 
         Raises:
-            StoreError: No store has the variant, or its report is damaged or can't be read now.
+            StoreError: The store lacks the variant, or its report is damaged or can't be read now.
         """
-        homes = [
-            home
-            for store in self.stores
-            for home in (store.variant(variant_id), trimmed_folder(store.variants, variant_id))
-        ]
-        return read_report(_first(homes, Path.is_dir))
+        trimmed = trimmed_folder(self.store.variants, variant_id)
+        return read_report(trimmed if trimmed.is_dir() else self.store.variant(variant_id))
 
     def render(self, cell_id: str, view: str) -> Path:
         """Return the file of the render of a view, which need not exist.
@@ -131,18 +124,8 @@ class JoinedStore:
         return cell.path / name
 
     def without_paths(self, text: str) -> str:
-        """Return a text without the paths of the stores: a report is the same wherever they are."""
-        for store in self.stores:
-            text = text.replace(f"{store.path}/", "")
-        return text
-
-    def latest_sweeps(self) -> tuple[str, ...]:
-        """Return the id of each store's latest sweep, without repetitions.
-
-        Raises:
-            StoreError: A store has no record of a sweep, or none that can be read.
-        """
-        return tuple(dict.fromkeys(store.latest_sweep() for store in self.stores))
+        """Return a text without the path of the store: a report is the same wherever it is."""
+        return text.replace(f"{self.store.path}/", "")
 
     def sweep_records(
         self, sweep_ids: Sequence[str]
@@ -150,48 +133,26 @@ class JoinedStore:
         """Join the records of sweeps.
 
         Args:
-            sweep_ids: Their ids; each is a sweep of one of the stores, or of several.
+            sweep_ids: Their ids.
 
         Returns:
             The arguments of `xrgs-sweep` of each record, by the sweep's id, and the rows of all,
             one for each scene, condition, label and replicate.
 
         Raises:
-            StoreError: No store has such a sweep, or its record is damaged.
+            StoreError: There is no such sweep, or its record is damaged.
             ReportError: Two records have different cells for one scene, condition, label and
                 replicate; the message names both.
         """
         commands: dict[str, tuple[str, ...]] = {}
         rows: dict[tuple[object, ...], tuple[str, RecordedCell]] = {}
         for sweep_id in sweep_ids:
-            for record in self._records(sweep_id):
-                commands[sweep_id] = record.command
-                for row in record.cells:
-                    key = (row.scene, row.condition, row.label, row.variant_seed, row.seed)
-                    rows[key] = sweep_id, _same(rows.get(key), sweep_id, row)
+            record = self.store.sweep_record(sweep_id)
+            commands[sweep_id] = record.command
+            for row in record.cells:
+                key = (row.scene, row.condition, row.label, row.variant_seed, row.seed)
+                rows[key] = sweep_id, _same(rows.get(key), sweep_id, row)
         return commands, [row for _, row in rows.values()]
-
-    def _records(self, sweep_id: str) -> list[SweepRecord]:
-        having = [store for store in self.stores if sweep_id in store.sweep_ids()]
-        if not having and len(self.stores) > 1:
-            paths = ", ".join(str(store.path) for store in self.stores)
-            raise StoreError(f"sweep={sweep_id}: there is no such sweep in {paths}")
-        return [store.sweep_record(sweep_id) for store in having or self.stores]
-
-
-def _first(found: Sequence[_T], *wanted: Callable[[_T], bool]) -> _T:
-    """Return the first that satisfies the first condition, else the next one; else the first."""
-    conditions = wanted if len(found) > 1 else ()  # one alone is returned without a look at it
-    fitting = (one for condition in conditions for one in found if condition(one))
-    return next(fitting, found[0])
-
-
-def _is_done(cell: CellFolder) -> bool:
-    return cell.state(verify=False).name == "done"
-
-
-def _is_there(cell: CellFolder) -> bool:
-    return cell.path.is_dir()
 
 
 def _same(known: tuple[str, RecordedCell] | None, sweep_id: str, row: RecordedCell) -> RecordedCell:

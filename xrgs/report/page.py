@@ -16,7 +16,7 @@ from xrgs.report.compare import Design, compare
 from xrgs.report.context import contexts, decided_by_one_view
 from xrgs.report.external import with_external
 from xrgs.report.html import write_document
-from xrgs.report.joined import Choice, JoinedStore, report_name
+from xrgs.report.joined import Choice, ReportStore, report_name
 from xrgs.report.markup import latex_file, to_markdown
 from xrgs.report.paper import paper_tables, texture_tables, why_no_table, with_texture
 from xrgs.report.photographs import photographs, with_variants
@@ -109,7 +109,7 @@ class Runs:
 
 
 def build(
-    store_paths: Path | Sequence[Path],
+    store_path: Path,
     sweep_ids: str | Sequence[str] | None = None,
     out: Path | None = None,
     pictures: Sequence[str] | None = None,
@@ -121,11 +121,10 @@ def build(
     """Write the tables, scores and figures of a sweep, or of several that are joined.
 
     Args:
-        store_paths: The store's folder, or the folders of the stores that have the cells.
-        sweep_ids: The id of the sweep, or the ids of those to join; None takes the latest one of
-            each store.
-        out: The folder to write to; None takes `reports/<sweep ids>` in the first store. To its
-            name `.scenes-<names>` and `.ablations-<names>` are added for a choice, and
+        store_path: The store's folder.
+        sweep_ids: The id of the sweep, or the ids of those to join; None takes the latest one.
+        out: The folder to write to; None takes `reports/<sweep ids>` in the store. To its name
+            `.scenes-<names>` and `.ablations-<names>` are added for a choice, and
             `.against-<label>` for another base than the baseline.
         pictures: Names of the pictures to draw, see `xrgs.report.pictures.draw`; None draws all.
         against: The label that all others are compared with. Where no cell is a baseline
@@ -139,25 +138,24 @@ def build(
         The report: its text and its files.
 
     Raises:
-        StoreError: No store holds such a sweep.
+        StoreError: The store has no such sweep.
         ReportError: The sweeps contradict each other, have nothing that is chosen, have cells that
             can't be compared, or have no such label; there is no picture of such a name; or `out`
             can't be written.
     """
-    paths = [store_paths] if isinstance(store_paths, Path) else store_paths
-    store = JoinedStore(tuple(map(Store, paths)))
+    store = ReportStore(Store(store_path))
     named = (sweep_ids,) if isinstance(sweep_ids, str) else sweep_ids
-    ids = tuple(dict.fromkeys(named or store.latest_sweeps()))
+    ids = tuple(dict.fromkeys(named or (store.store.latest_sweep(),)))
     commands, rows = store.sweep_records(ids)
     base = _base(rows, against)
-    sweep = read_cells(store, commands, choice.rows(rows, base))
+    sweep = read_cells(store.store, commands, choice.rows(rows, base))
     sweep = with_variants(sweep, store)
     sweep = with_external(sweep, store, externals)
     store = replace(store, external=sweep.renders)
     sweep = replace(sweep, views=with_texture(store, sweep.cells, sweep.views))
     tables = _tables(sweep, base, design)
     name = _folder_name(ids, choice, against, externals)
-    folder = out if out else store.stores[0].reports / name
+    folder = out if out else store.store.reports / name
     try:
         folder.mkdir(parents=True, exist_ok=True)
         drawn = _write(folder, store, sweep, tables, pictures)
@@ -194,7 +192,7 @@ def _folder_name(
 
 def _write(
     folder: Path,
-    store: JoinedStore,
+    store: ReportStore,
     sweep: Sweep,
     tables: Tables,
     pictures: Sequence[str] | None,
@@ -355,9 +353,6 @@ def _warnings(sweep: Sweep) -> list[str]:
             f"Renders of another program: {others}. Their PNGs are scored, and compared with the"
             " cells of the lowest seed; time, Gaussians and memory are not known."
         )
-    unknown = sweep.cells.loc[sweep.cells["state"] == "unknown", "cell_id"].nunique()
-    if unknown:
-        warnings.append(f"{counted(unknown, 'cell')} can't be read now: run the report again.")
     warnings += _stale_warning(sweep)
     if why := why_no_table(sweep.cells["label"], sweep.cells["scene"]):
         warnings.append(why)

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from xrgs.evaluation.metrics import Metric
     from xrgs.report.compare import Comparison
     from xrgs.report.context import Context
-    from xrgs.report.joined import JoinedStore
+    from xrgs.report.joined import ReportStore
     from xrgs.report.writing import Change
 
 #: Labels of the full XR-GS, with one reading of section 5.4 each.
@@ -231,7 +231,7 @@ def _verdict(found: Change, paper: float) -> str:
 _PHOTOGRAPH = ["variant_id", "split", "view"]
 
 
-def with_texture(store: JoinedStore, cells: pd.DataFrame, views: pd.DataFrame) -> pd.DataFrame:
+def with_texture(store: ReportStore, cells: pd.DataFrame, views: pd.DataFrame) -> pd.DataFrame:
     """Return the scores of views with the texture of each view's photograph.
 
     Args:
@@ -253,7 +253,7 @@ def with_texture(store: JoinedStore, cells: pd.DataFrame, views: pd.DataFrame) -
     return views.assign(texture=found.to_numpy(np.float64))
 
 
-def _texture_of(store: JoinedStore, variant_id: str, split: str, view: str) -> float:
+def _texture_of(store: ReportStore, variant_id: str, split: str, view: str) -> float:
     """Return the texture of one photograph; NaN where it can't be read."""
     try:
         variant = store.variant(variant_id)

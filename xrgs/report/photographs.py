@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from xrgs.report.collect import Sweep
-    from xrgs.report.joined import JoinedStore
+    from xrgs.report.joined import ReportStore
 
 #: The most names in a sentence on views that are not placed: all that a scene is likely to have.
 _MAX_NAMES = 200
@@ -22,7 +22,7 @@ _MAX_NAMES = 200
 _MEANINGLESS = "the split by variant.tags="
 
 
-def with_variants(sweep: Sweep, store: JoinedStore) -> Sweep:
+def with_variants(sweep: Sweep, store: ReportStore) -> Sweep:
     """Return a sweep with the reports of its finished cells' variants.
 
     A variant whose report can't be read has a report that says so.

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from xrgs.report.compare import Comparison
-    from xrgs.report.joined import JoinedStore
+    from xrgs.report.joined import ReportStore
 
     _Drawing = Callable[[Path], "Picture"]  # draws into the file
 
@@ -75,7 +75,7 @@ class Picture:
 
 
 def draw(
-    store: JoinedStore,
+    store: ReportStore,
     comparison: Comparison,
     views: pd.DataFrame,
     quality: pd.DataFrame,
@@ -332,7 +332,7 @@ def median_view(base: pd.Series, ablation: pd.Series) -> str:
 
 
 def _views(
-    store: JoinedStore,
+    store: ReportStore,
     pair: pd.Series,
     base: str,
     psnr: tuple[pd.Series, pd.Series],
@@ -365,7 +365,7 @@ def _views(
     return Picture(title, file)
 
 
-def _training(store: JoinedStore, pair: pd.Series, base: str, file: Path) -> Picture:
+def _training(store: ReportStore, pair: pd.Series, base: str, file: Path) -> Picture:
     title = f"{_title(pair)}: training"
     runs = []
     for name, key in ((base, "base_id"), (str(pair["label"]), "cell_id")):
@@ -383,7 +383,7 @@ def _title(pair: pd.Series) -> str:
     return ", ".join(str(part) for part in parts if part)
 
 
-def _image(store: JoinedStore, file: Path) -> NDArray[np.float32]:
+def _image(store: ReportStore, file: Path) -> NDArray[np.float32]:
     try:
         return images.read_png(file, max_pixels=_MAX_PIXELS)
     except (UnreadableError, ImageError) as error:

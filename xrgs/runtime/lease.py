@@ -6,29 +6,15 @@ them pass it on from one machine to another. A process that finds the lease of a
 the next generation: of any number of contenders one succeeds, and none deletes a file that another
 one has just created.
 
-The file holds its owner's signature and a counter of heartbeats. A thread of the owner raises the
-counter every `BEAT_S` seconds. It writes into the file that it has created, and never creates or
-replaces one: where another process has taken over meanwhile, nothing is disturbed.
+The file holds its owner's signature. A thread of the owner renews the file's date every `BEAT_S`
+seconds. It never creates or replaces a file: where another process has taken over meanwhile,
+nothing is disturbed.
 
-An owner is alive or dead by these rules:
-
-- An owner in the same place (host name, boot and process namespace) is alive as long as its process
-  exists, suspended or not.
-- An owner elsewhere is alive while its file is young: changed less than `SILENT_S` seconds ago.
-  Both times are the file server's, so that machines whose clocks differ do no harm.
-- The file of an owner elsewhere that is older, or dated in the future, does not say enough, because
-  the file server's clock may have been set. The observer watches it: the owner is dead when content
-  and time have stood still for `CONFIRM_S` seconds of the observer's own clock, which nobody sets.
-  Until then the owner counts as alive.
-- A file without a signature is free when it is older than `_UNSIGNED_S` seconds. Its creator signs
-  it at once, and looks for other owners only then: a creator that was killed or suspended in
-  between does not hold the lease yet. Such a file that is dated in the future is watched like the
-  others.
-- The owner of a file that can't be read now counts as alive.
-
-Watching does not wait: `acquire` and `holders` look at a file, and compare it with the last look of
-this process. Between two looks at most `BEAT_S` seconds are counted, so that an owner
-is not dead before its next heartbeat when a file server has answered nobody for a while.
+An owner in the same place (host name, boot and process namespace) is alive as long as its process
+exists, suspended or not. An owner elsewhere, or one that has not signed its file yet, is alive
+while the file's date is less than `SILENT_S` seconds from now. Both times are the file server's, so
+that machines whose clocks differ do no harm. An owner that is cut off from the file server for so
+long loses its lease; it notices before it writes a result (`Lease.lost`).
 """
 
 from __future__ import annotations
@@ -41,16 +27,13 @@ import socket
 import threading
 import time
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from enum import Enum
-from time import monotonic
 from typing import TYPE_CHECKING
 
 import msgspec
 
 from xrgs.runtime import processes
-from xrgs.runtime.text import format_duration
-from xrgs.safeio.files import is_transient, read_bytes
+from xrgs.safeio.files import read_bytes
 from xrgs.safeio.sanitize import for_line
 
 if TYPE_CHECKING:
@@ -60,30 +43,21 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 #: Seconds between two heartbeats, and seconds without one after which an owner on another machine
-#: may be dead.
+#: is dead.
 BEAT_S = 30.0
 SILENT_S = 600.0
-#: Seconds that a watched file has to stand still: two heartbeats, and a margin.
-CONFIRM_S = 65.0
-#: The most seconds into the future of a file's date that are an inexact clock or a cache.
-_AHEAD_S = 5.0
-#: Seconds that a lease may be without its owner's signature.
-_UNSIGNED_S = 30.0
 #: Seconds between two tries of `waited_for`.
 _POLL_S = 0.5
-#: Bytes of a lease's file, filled with spaces so that each heartbeat replaces all of it at once,
-#: and the most that is read.
-_BYTES, _MAX_BYTES = 1024, 4096
+#: The most bytes of a lease's file that are read.
+_MAX_BYTES = 4096
 
 
 class _State(Enum):
     """The state of the owner of a lease's file."""
 
     ALIVE = 1
-    WATCHED = 2
-    """Counts as alive until it was watched for long enough."""
-    DEAD = 3
-    RELEASED = 4
+    DEAD = 2
+    RELEASED = 3
     """The file is gone, or is another owner's now."""
 
 
@@ -117,7 +91,6 @@ class Lease:
     def __init__(self, path: Path, owner: Owner) -> None:
         """Start the heartbeats of a lease's file that `sign` has just created."""
         self.path, self.owner = path, owner
-        self.beats = 0
         self.lost = False
         """Whether another process has taken over: this process was suspended, or cut off from the
         file server, for too long. The cell's files are the other one's then."""
@@ -133,20 +106,13 @@ class Lease:
         # Where the file server is out of reach now, a later heartbeat decides.
         with suppress(OSError):
             try:
-                self.lost = self.lost or not (self._write() and self._is_last())
+                mine = _parse(read_bytes(self.path, _MAX_BYTES)) == self.owner
+                self.lost = self.lost or not (mine and self._is_last())
+                if not self.lost:
+                    os.utime(self.path)
             except FileNotFoundError:
                 self.lost = True
         return not self.lost
-
-    def _write(self) -> bool:
-        """Write the signature with the next count; return False if the file is another owner's."""
-        with self.path.open("r+b") as stream:
-            if _parse(stream.read(_MAX_BYTES)) not in {None, self.owner}:
-                return False
-            self.beats += 1
-            stream.seek(0)
-            stream.write(_text(self.owner, self.beats))
-        return True
 
     def _is_last(self) -> bool:
         name, generation = _parts(self.path)
@@ -161,15 +127,14 @@ class Lease:
 
 
 def acquire(folder: Path, name: str) -> Lease | None:
-    """Take a lease; return None if its owner is alive or is still watched.
+    """Take a lease; return None if its owner is alive.
 
     Raises:
         OSError: The folder of the leases can't be read or written.
     """
-    taken = {_State.ALIVE, _State.WATCHED}
     while True:
         files = _generations(folder, name)
-        if any(_look(file)[0] in taken for file in files.values()):
+        if any(_state(file) is _State.ALIVE for file in files.values()):
             return None
         file = folder / f"{name}.{max(files, default=-1) + 1}"
         try:
@@ -179,8 +144,8 @@ def acquire(folder: Path, name: str) -> Lease | None:
         # The list above may be outdated. A contender that came since is found by listing once more:
         # of two, at least one sees the other. If both give way, nothing is lost but a try.
         others = [other for other in _generations(folder, name).values() if other != file]
-        states = [(other, _look(other)[0]) for other in others]
-        if any(state in taken for _, state in states):
+        states = [(other, _state(other)) for other in others]
+        if any(state is _State.ALIVE for _, state in states):
             file.unlink(missing_ok=True)
             return None
         for other, state in states:
@@ -211,40 +176,24 @@ def waited_for(folder: Path, name: str) -> Iterator[Lease]:
         lease.release()
 
 
-def free_if_dead(folder: Path, name: str) -> None:
-    """Remove the files of dead owners of a lease, if this process has watched them long enough."""
-    if any(_parts(file)[0] == name for file in _files(folder)):
-        lease = acquire(folder, name)
-        if lease is not None:
-            lease.release()
-
-
 def names(folder: Path) -> set[str]:
     """Return the names of all leases in a folder, whether their owners are alive or not."""
     return {_parts(file)[0] for file in _files(folder)}
 
 
 def holders(folder: Path) -> dict[str, str]:
-    """Describe the owner of each lease in a folder, without owners that are known to be dead.
+    """Describe the owner of each lease in a folder, without dead owners.
 
-    Owners that may be dead are watched from then on. The folder need not exist.
+    The folder need not exist.
 
     Returns:
         Descriptions for people, by the name of the lease.
     """
-    found = {}
-    for file in _files(folder):
-        state, age = _look(file)
-        if state in {_State.ALIVE, _State.WATCHED}:
-            owner = str(signature(file) or "a process that has not signed its lease yet")
-            found[_parts(file)[0]] = owner + (_silent(age) if state is _State.WATCHED else "")
-    return found
-
-
-def _silent(age: float) -> str:
-    if age < 0:
-        return f"; its lease is dated {format_duration(-age)} in the future; it may be dead"
-    return f", silent for {format_duration(age)}; it may be dead"
+    return {
+        _parts(file)[0]: str(signature(file) or "a process that has not signed its lease yet")
+        for file in _files(folder)
+        if _state(file) is _State.ALIVE
+    }
 
 
 def sign(path: Path) -> Owner:
@@ -256,7 +205,7 @@ def sign(path: Path) -> Owner:
     owner = _self()
     with path.open("xb") as stream:
         try:
-            stream.write(_text(owner, 0))
+            stream.write(json.dumps(msgspec.structs.asdict(owner)).encode())
             stream.flush()
         except BaseException:
             path.unlink(missing_ok=True)
@@ -270,11 +219,6 @@ def signature(path: Path) -> Owner | None:
         return _parse(read_bytes(path, _MAX_BYTES))
     except OSError:
         return None
-
-
-def _text(owner: Owner, beats: int) -> bytes:
-    values = msgspec.structs.asdict(owner) | {"beats": beats}
-    return json.dumps(values).encode().ljust(_BYTES - 1) + b"\n"
 
 
 def _parse(content: bytes) -> Owner | None:
@@ -301,59 +245,22 @@ def _generations(folder: Path, name: str) -> dict[int, Path]:
     return {_parts(file)[1]: file for file in files if file.suffix[1:].isdecimal()}
 
 
-def _look(file: Path) -> tuple[_State, float]:
-    """Return the state of a lease's owner, and the seconds since the file changed, 0 if here."""
+def _state(file: Path) -> _State:
+    """Return the state of a lease's owner; one whose file can't be read counts as alive."""
     try:
-        content, status = read_bytes(file, _MAX_BYTES), file.stat()
+        content, changed = read_bytes(file, _MAX_BYTES), file.stat().st_mtime
     except FileNotFoundError:
-        return _State.RELEASED, 0.0
-    except OSError as error:
-        # A folder or a pipe is not a lease of any process.
-        return (_State.ALIVE if is_transient(error) else _State.DEAD), 0.0
+        return _State.RELEASED
+    except OSError:
+        return _State.ALIVE
     owner = _parse(content)
     if owner is None or not owner.here:
-        age = _now(file.parent) - status.st_mtime
-        return _judged(owner, age, status, content), age
+        # A live owner mends a date far in the future with its next heartbeat.
+        alive = abs(_now(file.parent) - changed) < SILENT_S
+        return _State.ALIVE if alive else _State.DEAD
     if owner.lives:
-        return _State.ALIVE, 0.0
-    return (_State.DEAD if signature(file) == owner else _State.RELEASED), 0.0
-
-
-def _judged(owner: Owner | None, age: float, status: os.stat_result, content: bytes) -> _State:
-    """Judge a lease whose owner is on another host, boot or process namespace."""
-    if -_AHEAD_S <= age < (_UNSIGNED_S if owner is None else SILENT_S):
         return _State.ALIVE
-    if (owner is None and age > 0) or _stands_still(status, content):
-        return _State.DEAD
-    return _State.WATCHED
-
-
-@dataclass
-class _Watch:
-    """The looks of this process at a file that does not tell whether its owner is alive."""
-
-    seen: tuple[int, bytes]
-    """The file's time, in nanoseconds, and its content."""
-    looked: float
-    """Time of the last look, seconds of the monotonic clock."""
-    still: float = 0.0
-    """Seconds that the file has stood still."""
-
-
-#: By device and inode: a store has several paths.
-_watches: dict[tuple[int, int], _Watch] = {}
-
-
-def _stands_still(status: os.stat_result, content: bytes) -> bool:
-    """Watch a file; return whether it has not changed for `CONFIRM_S` seconds."""
-    key, now = (status.st_dev, status.st_ino), monotonic()
-    seen = (status.st_mtime_ns, content)
-    watch = _watches.get(key)
-    if watch is None or watch.seen != seen:
-        watch = _watches[key] = _Watch(seen, now)
-    watch.still += min(now - watch.looked, BEAT_S)
-    watch.looked = now
-    return watch.still >= CONFIRM_S
+    return _State.DEAD if signature(file) == owner else _State.RELEASED
 
 
 def _now(folder: Path) -> float:

@@ -4,29 +4,24 @@
 a store when it is unpacked. It has what tables are made of and what a sweep goes on from, without
 logs, and without the full paths of photographs and stores that configs and commands name.
 
-`import_store` copies a store of somebody else, an archive or a folder, into one's own. Every file
-is checked there once: its kind, name and size, its type where it is JSON or CSV, and its hash. What
-does not pass is left out and named. Nothing else in xrgs looks at files with such suspicion.
+`import_store` copies a store of somebody else, an archive or a folder, into one's own. Archives are
+unpacked by tarfile's filter `data`. Each file is decoded by its type where it is JSON or CSV, and
+verified by its hash. What does not pass is left out and named.
 """
 
 from __future__ import annotations
 
 import hashlib
 import io
-import itertools
 import json
-import math
-import os
 import re
+import shutil
 import stat
 import tarfile
-import time
-import unicodedata
-from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import PurePath
-from typing import IO, TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
@@ -35,19 +30,20 @@ from xrgs.mixture import paths, saved_variant, variant
 from xrgs.photos import scenes
 from xrgs.runtime import lease
 from xrgs.runtime.progress import progress
+from xrgs.runtime.text import listed
 from xrgs.safeio.atomic import atomic_writer, json_text
 from xrgs.safeio.files import is_inside, is_name, remove_path, sync_name, sync_tree, walk_files
 from xrgs.safeio.hashing import digest
-from xrgs.safeio.records import MAX_BYTES, errors_named, read_file, read_struct, read_table
+from xrgs.safeio.records import errors_named, read_file, read_struct, read_table
 from xrgs.safeio.sanitize import counted, for_line
 from xrgs.store import trimming
-from xrgs.store.cell_folder import CONFIG, CellFolder, CellState
+from xrgs.store.cell_folder import CONFIG, NOT_RESULTS, STATUS, CellFolder, CellState
 from xrgs.store.identity import cell_id
 from xrgs.store.schema import FileEntry, SweepRecord
 from xrgs.store.store import MAX_RECORD_BYTES
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Sequence
     from pathlib import Path
 
     from xrgs.store.store import Store
@@ -203,39 +199,20 @@ def _relative_argument(word: str, here: Path) -> str:
 
 # Importing
 
-#: The most files and bytes that an archive or a folder may have.
-_MAX_FILES, _MAX_IMPORT_BYTES = 1_000_000, 1 << 40
-#: The most lines about what was left out, and the most names in one of them.
-_MAX_LINES, _MAX_NAMES = 1000, 3
-#: The largest header of a tar member, in bytes. tarfile reads such a header whole.
-_MAX_HEADER_BYTES = 1 << 20
-_CHUNK = 1 << 20
-#: The hidden folder, beside the final places, of what is not checked yet.
+#: The hidden folder, in the store and beside the final places, of what has no name yet.
 _STAGING = ".importing"
-_PICTURE_BYTES = 1 << 28
 _ID = "[0-9a-f]{16}"
-#: The files that an import takes, and the largest size of each, in bytes.
-_TAKEN = tuple(
-    (re.compile(pattern), most)
-    for pattern, most in {
-        f"cells/{_ID}/(config|identity|provenance|status|summary)\\.json": MAX_BYTES,
-        f"cells/{_ID}/(history|quality|scores)\\.csv": MAX_BYTES,
-        f"cells/{_ID}/splats\\.ply": 1 << 33,
-        f"cells/{_ID}/renders/[^/]+\\.png": _PICTURE_BYTES,
-        f"variants/(trimmed-)?{_ID}-{_ID}/(variant|report)\\.json": MAX_BYTES,
-        f"variants/(trimmed-)?{_ID}-{_ID}/points\\.npz": _MAX_POINTS_BYTES,
-        f"variants/{_ID}-{_ID}/images/[^/]+/[^/]+\\.png": _PICTURE_BYTES,
-        f"scenes/{_ID}/scene\\.json": MAX_BYTES,
-        f"scenes/{_ID}/[^/]+\\.png": _PICTURE_BYTES,
-        f"sweeps/{_ID}\\.json": MAX_RECORD_BYTES,
-    }.items()
-)
+#: The names of what is imported, by the folder of its kind.
+_NAMES = {
+    "variants": re.compile(f"(trimmed-)?{_ID}-{_ID}"),
+    "scenes": re.compile(_ID),
+    "cells": re.compile(_ID),
+    "sweeps": re.compile(f"{_ID}\\.json"),
+}
 #: What stores have besides, and an import passes over: what is running, made again, or set aside.
-_PASSED_OVER = re.compile(
-    r"(.*/)?\..*|(hydra|locks|reports)/.*|variants/failed-.*|cells/[^/]+\.aside-.*"
-    rf"|cells/{_ID}/(log\.txt|error\.txt|progress\.json|(refused-)?checkpoint\.npz)"
-    rf"|variants/{_ID}-{_ID}/colmap\.log"
-)
+_PASSED_OVER = re.compile(r"\..*|failed-.*|.*\.aside-.*")
+#: Files of a cell or a variant that are not copied.
+_NOT_COPIED = (NOT_RESULTS - {STATUS}) | {saved_variant.LOG}
 #: Files that every done cell has.
 _OF_EVERY_CELL = ("config.json", "identity.json", "provenance.json", "summary.json", "scores.csv")
 
@@ -273,48 +250,70 @@ def import_store(source: Path, store: Store) -> Imported:
         The numbers of what was imported, and a line for each thing that was left out.
 
     Raises:
-        StoreError: The source is no folder and no archive, or the store can't be written.
+        StoreError: The source is no store; an archive is damaged, or has a link or a name outside
+            its folder; or the store can't be written.
     """
     store.prepare()
     with errors_named(store.path), lease.waited_for(store.path, ".import.lock"):
-        border = _Border(store)
+        importing = _Import(store)
+        importing.clear()
         try:
-            border.clear()
-            border.receive(source)
-            return border.admit()
+            return importing.copy_all(_root(source, importing.unpacked))
         finally:
-            border.clear()
+            importing.clear()
+
+
+def _root(source: Path, unpacked: Path) -> Path:
+    """Return the folder of the source that has `cells`; an archive is unpacked first."""
+    folder = source
+    if not source.is_dir():
+        unpacked.mkdir()
+        _unpack(source, unpacked)
+        folder = unpacked
+    with errors_named(source):
+        inside = sorted(path for path in folder.iterdir() if path.is_dir())
+    for root in (folder, *inside):  # the store may have a folder around it
+        if any((root / kind).is_dir() for kind in _NAMES):
+            return root
+    raise StoreError(f"{source}: not a store: it has no folder {', '.join(_NAMES)}")
+
+
+def _unpack(archive: Path, folder: Path) -> None:
+    with errors_named(archive):
+        content = archive.open("rb")
+    with content:
+        try:
+            with tarfile.open(fileobj=content) as opened:
+                opened.extractall(folder, filter=_regular_files)  # noqa: S202
+        except Exception as error:
+            if isinstance(error, OSError) and error.errno is not None:
+                raise
+            # tarfile, zlib and lzma raise errors of many types for damaged data.
+            raise StoreError(f"{archive}: not an archive of a store ({error})") from error
+
+
+def _regular_files(member: tarfile.TarInfo, folder: str) -> tarfile.TarInfo | None:
+    """Filter an archive: only regular files are unpacked, and none outside the folder."""
+    member = tarfile.data_filter(member, folder)
+    if member.isdir():
+        return None
+    if not member.isreg():
+        raise tarfile.SpecialFileError(member)
+    return member
 
 
 @dataclass
-class _Member:
-    """A file, a folder or something else in an archive or a folder."""
-
-    name: str
-    """Its path, with `/`."""
-    size: int
-    modified: float
-    wrong: str
-    """Why it is not taken; empty for a regular file."""
-    open: Callable[[], IO[bytes] | None]
-
-
-@dataclass
-class _Border:
-    """Receives the files of one import, and admits what is whole.
-
-    A cell, a variant, a scene or a record is an item, named by its kind and its name in the store:
-    `cells/0123456789abcdef`.
-    """
+class _Import:
+    """Copies what is whole. An item is a cell, a variant, a scene or a record of a sweep."""
 
     store: Store
     left_out: dict[str, list[str]] = field(default_factory=dict)
     """The names of what is not imported, by the reason."""
-    received: dict[str, set[str]] = field(default_factory=dict)
-    """The files of each item, as file systems see them that ignore case."""
-    refused: dict[str, str] = field(default_factory=dict)
-    """Why an item is not admitted, where that is known before it is whole."""
-    present: set[str] = field(default_factory=set)
+
+    @property
+    def unpacked(self) -> Path:
+        """The hidden folder for the content of an archive."""
+        return self.store.path / _STAGING
 
     def homes(self) -> dict[str, Path]:
         """Return the folder of each kind of item."""
@@ -328,210 +327,68 @@ class _Border:
 
     def clear(self) -> None:
         """Remove what this import, or a stopped one before it, has left in the hidden folders."""
-        for home in self.homes().values():
+        for home in (self.store.path, *self.homes().values()):
             remove_path(home / _STAGING)
 
-    def leave_out(self, name: str, why: str) -> None:
-        """Remember something that is not imported, and why."""
-        self.left_out.setdefault(why, []).append(name)
+    def copy_all(self, root: Path) -> Imported:
+        """Check each item of a folder, and copy it to its place in the store."""
+        items = [
+            path
+            for kind in self.homes()
+            if (root / kind).is_dir()
+            for path in sorted((root / kind).iterdir())
+            if not _PASSED_OVER.fullmatch(path.name)
+        ]
+        count, present = dict.fromkeys(self.homes(), 0), 0
+        for item in progress(items, "importing", "item"):
+            kind = item.parent.name
+            try:
+                self._check(item)
+                copied = not self._is_present(item) and self._copy(item)
+            except XrgsError as error:
+                message = str(error).replace(f"{item}/", "").replace(str(item), "it")
+                self.left_out.setdefault(message, []).append(f"{kind}/{item.name}")
+                continue
+            count[kind] += copied
+            present += not copied
+        lines = (f"{listed(names)}: {why}" for why, names in self.left_out.items())
+        return Imported(**count, present=present, left_out=tuple(map(for_line, lines)))
 
-    # Receiving
+    def _check(self, item: Path) -> None:
+        kind = item.parent.name
+        if not _NAMES[kind].fullmatch(item.name):
+            raise StoreError("no store has anything of this name")
+        if self._is_present(item):
+            return
+        with errors_named(item):
+            files = [("", item.lstat())] if kind == "sweeps" else walk_files(item)
+            for name, status in files:
+                if not stat.S_ISREG(status.st_mode):
+                    raise StoreError(f"{name or 'it'}: not a regular file")
+            _CHECKS[kind](item)
 
-    def receive(self, source: Path) -> None:
-        """Copy the files that a store may have into the hidden folders."""
-        total = 0
-        try:
-            for number, member in enumerate(progress(_members(source), "reading", "file")):
-                total += member.size
-                if number >= _MAX_FILES or total > _MAX_IMPORT_BYTES:
-                    what = f"more than {_MAX_FILES} files or {_MAX_IMPORT_BYTES} bytes"
-                    self.leave_out(str(source), f"{what}: the rest was not read")
-                    return
-                self._receive_one(member)
-        except tarfile.TarError as error:
-            if not self.received:
-                raise StoreError(f"{source}: not an archive of a store ({error})") from error
-            self.leave_out(str(source), f"damaged, the rest can't be read ({error})")
-
-    def _receive_one(self, member: _Member) -> None:
-        name = member.name.removeprefix("./")
-        if not is_inside(name):
-            self.leave_out(member.name, "not the path of a file in a store")
-            return
-        top, _, below = name.partition("/")
-        if top not in {*self.homes(), "hydra", "locks", "reports"}:
-            name = below or name  # the store has a folder around it
-        if not name or _PASSED_OVER.fullmatch(name):
-            return
-        most = next((most for pattern, most in _TAKEN if pattern.fullmatch(name)), None)
-        if most is None:
-            self.leave_out(member.name, member.wrong or "no store has a file of this name")
-            return
-        kind, item_name, *_ = name.split("/")
-        item = f"{kind}/{item_name}"
-        if item in self.present or item in self.refused:
-            return
-        if self._is_present(kind, item_name):
-            self.present.add(item)
-            return
-        why = member.wrong or (f"{member.size} bytes, at most {most}" if member.size > most else "")
-        # On file systems that ignore case or the form of accents, two such names are one.
-        plain = unicodedata.normalize("NFC", name).casefold()
-        files = self.received.setdefault(item, set())
-        if plain in files:
-            why = "another file has the same name, or one that differs in case alone"
-        if why:
-            self.refused[item] = f"{name}: {why}"
-            return
-        files.add(plain)
-        self._copy(member, self._staged(item, name))
-
-    def _is_present(self, kind: str, name: str) -> bool:
-        home = self.homes()[kind]
-        if kind != "variants":
-            return (home / name).exists()
-        variant_id = paths.id_of(name)  # of a variant, with its images or trimmed
+    def _is_present(self, item: Path) -> bool:
+        home = self.homes()[item.parent.name]
+        if item.parent.name != "variants":
+            return (home / item.name).exists()
+        variant_id = paths.id_of(item.name)  # of a variant, with its images or trimmed
         return (home / variant_id).exists() or paths.trimmed_folder(home, variant_id).exists()
 
-    def _staged(self, item: str, name: str = "") -> Path:
-        """Return the hidden path of an item, or of a file in it."""
-        kind, _, inside = (name or item).partition("/")
-        return self.homes()[kind] / _STAGING / inside
-
-    def _copy(self, member: _Member, target: Path) -> None:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        stream = member.open()
-        if stream is None:
-            raise StoreError(f"{member.name}: not a regular file")
-        with stream, target.open("xb") as copy:
-            left = member.size
-            while left > 0:
-                with _errors_of_archives():
-                    chunk = stream.read(min(left, _CHUNK))
-                if not chunk:
-                    break  # the hash will tell
-                copy.write(chunk)
-                left -= len(chunk)
-        _set_time(target, member.modified)
-
-    # Admitting
-
-    def admit(self) -> Imported:
-        """Check each item, and give it its name in the store."""
-        count = dict.fromkeys(self.homes(), 0)
-        kinds = list(count)
-        items = sorted(self.received, key=lambda item: (kinds.index(item.partition("/")[0]), item))
-        for item in progress(items, "checking", "item"):
-            kind = item.partition("/")[0]
-            try:
-                if item in self.refused:
-                    raise StoreError(self.refused[item])
-                _CHECKS[kind](self._staged(item))
-            except XrgsError as error:
-                staged = str(self._staged(item))
-                message = str(error).replace(f"{staged}/", "").replace(staged, "it")
-                self.leave_out(item, message)
-                continue
-            if self._name(item):
-                count[kind] += 1
-            else:
-                self.present.add(item)
-        return Imported(**count, present=len(self.present), left_out=tuple(self._lines()))
-
-    def _lines(self) -> Iterator[str]:
-        """Yield a line for each reason, with the first names that it is of."""
-        for why, names in itertools.islice(self.left_out.items(), _MAX_LINES):
-            rest = len(names) - _MAX_NAMES
-            more = f" and {rest} more" if rest > 0 else ""
-            yield for_line(f"{', '.join(names[:_MAX_NAMES])}{more}: {why}", 500)
-        if (rest := len(self.left_out) - _MAX_LINES) > 0:
-            yield f"and {rest} more reasons"
-
-    def _name(self, item: str) -> bool:
-        """Give an item its name; return False where another process did so meanwhile."""
-        kind, _, name = item.partition("/")
-        staged, home = self._staged(item), self.homes()[kind] / name
-        if staged.is_dir():
-            sync_tree(staged)
-        else:
-            with staged.open("rb") as stream:
-                os.fsync(stream.fileno())
-        if self._is_present(kind, name):
+    def _copy(self, item: Path) -> bool:
+        """Copy an item; return False where another process made it meanwhile."""
+        home = self.homes()[item.parent.name]
+        staged = home / _STAGING / item.name
+        files = [name for name, _ in walk_files(item)] if item.is_dir() else [""]
+        for name in files:
+            if name not in _NOT_COPIED:
+                (staged / name).parent.mkdir(parents=True, exist_ok=True)
+                shutil.copy2(item / name, staged / name)
+        sync_tree(staged.parent)
+        if self._is_present(item):
             return False
-        staged.rename(home)
-        sync_name(home)
+        staged.rename(home / item.name)
+        sync_name(home / item.name)
         return True
-
-
-def _set_time(file: Path, modified: float) -> None:
-    """Keep the time of a file, for the order of records; a time in the future becomes now."""
-    now = time.time()
-    kept = min(max(modified, 0.0), now) if math.isfinite(modified) else now
-    os.utime(file, (kept, kept))
-
-
-def _members(source: Path) -> Iterator[_Member]:
-    """Yield all that an archive or a folder has, without folders; links are not followed.
-
-    Raises:
-        StoreError: The source can't be read.
-        tarfile.TarError: It is no archive, or is damaged.
-    """
-    if source.is_dir():
-        with errors_named(source):
-            for name, status in walk_files(source):
-                wrong = "" if stat.S_ISREG(status.st_mode) else "not a regular file"
-                size, modified = status.st_size, status.st_mtime
-                yield _Member(name, size, modified, wrong, partial(_open, source / name))
-        return
-    with errors_named(source):
-        content = source.open("rb")
-    with content, ExitStack() as stack:
-        with _errors_of_archives():
-            archive = stack.enter_context(
-                tarfile.open(fileobj=content, mode="r|*", tarinfo=_Header)
-            )
-        while True:
-            with _errors_of_archives():
-                header = archive.next()
-            if header is None:
-                return
-            archive.members.clear()  # type: ignore[attr-defined]  # tarfile would keep them all
-            if header.isdir():
-                continue
-            regular = header.type in (tarfile.REGTYPE, tarfile.AREGTYPE) and not header.issparse()
-            wrong = "" if regular else "not a regular file"
-            extracted = partial(archive.extractfile, header)
-            yield _Member(header.name, header.size, float(header.mtime), wrong, extracted)
-
-
-def _open(file: Path) -> IO[bytes]:
-    return file.open("rb")
-
-
-@contextmanager
-def _errors_of_archives() -> Iterator[None]:
-    """Turn whatever tarfile raises for damaged data, even TypeError, into `tarfile.TarError`."""
-    try:
-        yield
-    except Exception as error:
-        if isinstance(error, tarfile.TarError) or getattr(error, "errno", None) is not None:
-            raise
-        raise tarfile.ReadError(str(error) or type(error).__name__) from error
-
-
-class _Header(tarfile.TarInfo):
-    """A header of an archive, whose long names and attributes have a bounded size."""
-
-    @classmethod
-    def frombuf(cls, buf: bytes | bytearray, encoding: str, errors: str) -> _Header:
-        header = super().frombuf(buf, encoding, errors)
-        kinds = (tarfile.XHDTYPE, tarfile.XGLTYPE, tarfile.SOLARIS_XHDTYPE)
-        long_names = (tarfile.GNUTYPE_LONGNAME, tarfile.GNUTYPE_LONGLINK)
-        most = _MAX_HEADER_BYTES if header.type in (*kinds, *long_names) else _MAX_IMPORT_BYTES
-        if not 0 <= header.size <= most:
-            raise tarfile.ReadError(f"a member or a header of {header.size} bytes")
-        return header
 
 
 def _check_cell(folder: Path) -> None:

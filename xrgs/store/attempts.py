@@ -117,7 +117,7 @@ def _stopped(cell: CellFolder) -> CellFolder | None:
 
 def _can_resume(attempt: CellFolder) -> bool:
     state = attempt.state()
-    if state.name == "unknown":
+    if state.unreadable:
         raise UnreadableError(f"{attempt.path}: {state.reason}")
     failed_late = state.name == "failed" and attempt.checkpoint.is_file()
     return state.name in {"planned", "unfinished"} or failed_late

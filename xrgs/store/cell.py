@@ -10,7 +10,7 @@ import time
 import traceback
 from contextlib import suppress
 from statistics import fmean
-from typing import TYPE_CHECKING, Any, Self, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 
@@ -28,6 +28,7 @@ from xrgs.store.schema import Summary
 from xrgs.store.scoring import scoring_code
 from xrgs.training import dataset
 from xrgs.training.checkpoint import Checkpoint, CheckpointError
+from xrgs.training.components import Components
 from xrgs.training.count_matching import train_cell
 
 if TYPE_CHECKING:
@@ -83,11 +84,17 @@ class CellCheckpoint(Checkpoint):
         self._rows, self._curves_due = 0, 0.0
         """Rows of the history in its file, and when the file may be written again."""
         self._recorder: TrainingRecorder | None = None
+        self._components = Components()
 
     def register(self, **objects: Stateful) -> None:
-        """Add objects to the checkpoint by name; the `recorder` is also read after every step."""
+        """Add objects to the checkpoint by name; `recorder` and `components` are read here too."""
         super().register(**objects)
         self._recorder = cast("TrainingRecorder | None", objects.get("recorder", self._recorder))
+        self._components = cast("Components", objects.get("components", self._components))
+
+    def findings(self) -> list[str]:
+        """Return what the components of the training have found."""
+        return self._components.findings()
 
     def save_if_due(self, step: int) -> float:
         """Write the checkpoint if the interval has passed or the process is to end.
@@ -198,14 +205,15 @@ def _train_and_score(
     # A search for a threshold trains several times, and only the last training is the cell's.
     searches = conf.components.count_matched.gaussians > 0
     checkpoint = CellCheckpoint(folder, conf.checkpoint_s, shown, stop, curves=not searches)
-    with _Found() as found:
-        trained, machines = _train_or_resume(data, conf, checkpoint, provenance.machine(what))
+    trained, machines = _train_or_resume(data, conf, checkpoint, provenance.machine(what))
     if len(machines) > 1:
         what = msgspec.structs.replace(what, machines_in_turn="; ".join(machines))
         _write_struct(folder.path / "provenance.json", what)
     shown.note = ""
-    count = len(trained.gaussians)
+    count, found = len(trained.gaussians), checkpoint.findings()
     _log.info("trained %d steps in %.1f s: %d Gaussians", conf.train.steps, trained.seconds, count)
+    for line in found:
+        _log.info("%s", line)
     peak_rss_bytes = peak_rss()  # read before evaluation, which may load the network of LPIPS
     save_ply(
         folder.path / "splats.ply",
@@ -231,29 +239,10 @@ def _train_and_score(
         grow_grad2d=trained.grow_grad2d,
         work=dict(trained.work),
         stage_seconds=dict(trained.stage_seconds),
-        found=tuple(dict.fromkeys(found.lines)),
+        found=tuple(found),
     )
     _write_struct(folder.path / "summary.json", summary)
     return [view.name for view in data.test]
-
-
-class _Found(logging.Handler):
-    """Keeps what components log while a `with` block runs: what they found out."""
-
-    def __init__(self) -> None:
-        super().__init__(logging.INFO)
-        self.lines: list[str] = []
-        self._logger = logging.getLogger("xrgs.training.components")
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self.lines.append(record.getMessage())
-
-    def __enter__(self) -> Self:
-        self._logger.addHandler(self)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._logger.removeHandler(self)
 
 
 def _train_or_resume(

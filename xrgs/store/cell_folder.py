@@ -39,7 +39,9 @@ _VERIFIED_BY_HASH = frozenset(
     {"config.json", "identity.json", "scores.csv", "summary.json", "history.csv", "quality.csv"}
 )
 CONFIG, IDENTITY, CHECKPOINT, LOG = "config.json", "identity.json", "checkpoint.npz", "log.txt"
-_NOT_RESULTS = frozenset({LOG, "status.json", "progress.json", CHECKPOINT, f"refused-{CHECKPOINT}"})
+STATUS = "status.json"
+#: Files in the folder of a done cell that its status does not list.
+NOT_RESULTS = frozenset({LOG, STATUS, "progress.json", CHECKPOINT, f"refused-{CHECKPOINT}"})
 
 
 @dataclass(frozen=True)
@@ -48,18 +50,19 @@ class CellState:
 
     name: str
     """`absent`, `planned` (a sweep has written its config), `unfinished`, `running`, `failed`,
-    `corrupt` or `done`; `unknown` where a file can't be read now: look again later."""
+    `corrupt` or `done`."""
     reason: str = ""
+    unreadable: bool = False
+    """Whether it is `failed` since a file can't be read. It may be done, and is not changed."""
 
     @classmethod
     def of_error(cls, error: StoreError | OSError) -> CellState:
         """Return the state of a cell whose files can't be read, or are damaged."""
-        if isinstance(error, UnreadableError):
-            return cls("unknown", f"it can't be read now: {error}")
         if isinstance(error, OSError):
-            kind = "unknown" if is_transient(error) else "corrupt"
-            return cls(kind, f"{error.filename}: {error.strerror}")
-        return cls("corrupt", str(error))
+            unreadable, reason = is_transient(error), f"{error.filename}: {error.strerror}"
+        else:
+            unreadable, reason = isinstance(error, UnreadableError), str(error)
+        return cls("failed" if unreadable else "corrupt", reason, unreadable)
 
 
 @dataclass(frozen=True)
@@ -88,7 +91,7 @@ class CellFolder:
     @property
     def status_file(self) -> Path:
         """File of the final state, written after all other files."""
-        return self.path / "status.json"
+        return self.path / STATUS
 
     # State
 
@@ -164,13 +167,13 @@ class CellFolder:
         """Hash every file of a finished cell, and decode its JSON.
 
         Returns:
-            A line for each file that is missing, damaged, has changed, can't be read now or does
+            A line for each file that is missing, damaged, has changed, can't be read or does
             not belong there; empty for an intact cell.
         """
         try:
             status = self.status()
             wrong = [line for name, of in status.files.items() if (line := self._wrong(name, of))]
-            listed = status.files.keys() | status.trimmed.keys() | _NOT_RESULTS
+            listed = status.files.keys() | status.trimmed.keys() | NOT_RESULTS
             wrong += [
                 f"{self.path}/{name}: it does not belong there"
                 for name, _ in walk_files(self.path)
@@ -217,7 +220,7 @@ class CellFolder:
         files = {
             name: FileEntry(status.st_size, file_digest(self.path / name))
             for name, status in sorted(walk_files(self.path))
-            if name not in _NOT_RESULTS
+            if name not in NOT_RESULTS
         }
         self._write_status(
             Status("done", views=tuple(views), files=files, scored_by=dict(scored_by))

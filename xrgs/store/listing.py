@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from xrgs.store.schema import Identity, RecordedCell, SweepRecord
 
 #: The states that a cell of a store can have.
-STATES = ("done", "running", "planned", "unfinished", "failed", "corrupt", "unknown")
+STATES = ("done", "running", "planned", "unfinished", "failed", "corrupt")
 #: The most ids that a message lists.
 _MAX_LISTED = 6
 
@@ -147,7 +147,7 @@ def cell_rows(
     rows = []
     for cell in cells:
         state = cell.state(verify=verify)
-        if state.name not in {"done", "unknown"} and cell.id in holders:
+        if state.name != "done" and cell.id in holders:
             state = cell.running(holders[cell.id])
         of = tuple(sweeps.get(cell.id, ()))
         rows.append(CellRow(cell, state, recorded.get(cell.id), of, _identity(cell)))

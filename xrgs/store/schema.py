@@ -129,8 +129,8 @@ class RecordedCell(Struct, frozen=True):
     error: str | None = None
     """Why the cell can't be trained."""
     state: Literal["unknown", "not placed"] | None = None
-    """`unknown` where a file could not be read, so that the cell has no id yet; `not placed` where
-    SfM has placed too few photographs of its scene."""
+    """`not placed` where SfM has placed too few photographs of its scene. Earlier versions also
+    wrote `unknown`."""
 
 
 class SweepRecord(Struct, frozen=True):

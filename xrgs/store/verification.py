@@ -72,7 +72,7 @@ def verify(store: Store) -> Verification:
 def describe(verification: Verification) -> str:
     """Return the damaged files and the extent of a verification, as lines for a terminal."""
     damage = verification.damage
-    lines = ["damaged, or can't be read now:", *(f"  {line}" for line in damage)] if damage else []
+    lines = ["damaged, or can't be read:", *(f"  {line}" for line in damage)] if damage else []
     extent = f"{verification.files:,} files, {format_size(verification.bytes)}"
     found = f"{len(damage)} damaged" if damage else "all of them as they were written"
     lines.append(f"hashed: {extent}, in {verification.seconds:.1f} s; {found}")
@@ -101,7 +101,7 @@ def _cells(store: Store) -> _Checks:
         state = cell.state(verify=False)
         if state.name == "done":
             yield cell.path, cell.verify
-        elif state.name in {"corrupt", "unknown"}:
+        elif state.name == "corrupt" or state.unreadable:
             yield cell.path, partial(list, [f"{cell.path}: {state.reason}"])
 
 

@@ -46,8 +46,6 @@ class PlannedVariant:
     """Why no variant can be made of the scene."""
     remembered: bool = False
     """Whether the store keeps the error, so that only `retry=failed` tries the scene again."""
-    unknown: str | None = None
-    """The file that can't be read now."""
     notes: tuple[str, ...] = ()
     """What its report says, or in a dry run what the report of a new variant would say."""
 
@@ -263,12 +261,10 @@ def _outcome(
         raise StoreError(f"store={store.path}: {error}. {worker.NOTHING_LOST}") from error
     except StoreGoneError:
         raise
-    except UnreadableError as error:
-        reason = str(error)
     except OSError as error:
         if not is_transient(error):
             raise
-        reason = str(error)
+        return PlannedVariant(error=str(error))
     except XrgsError as error:
         if building:
             store.check_not_gone()
@@ -276,7 +272,6 @@ def _outcome(
             store.check_room()
         # The reason that the store keeps: a sweep that is planned again has the same record then.
         return _failure(conf, store) or PlannedVariant(error=str(error))
-    return PlannedVariant(unknown=f"its variant can't be read now: {reason}")
 
 
 def _failure(conf: Conf, store: Store) -> PlannedVariant | None:

@@ -1,40 +1,29 @@
 """Estimates the time, memory and disk of a cell from the nearest finished cells of the store.
 
 The config of the nearest cells differs in the fewest keys; another variant, processor or backend
-counts as several keys. The time of a step is taken to be proportional to
-
-    rendered pixels + Gaussians,
-
-with means over the steps. The pixels follow from the views of the variant and the components that
-change the size of a render (`_rendered`). The Gaussians are those of the nearest cell, within the
-budgets of the planned one. Of several equally near cells the median counts. A store without
-finished cells gives no estimate.
-
-In least squares of 111 cells of 2,000 steps at 500 px on one thread of an AMD EPYC (November 2026),
-a rendered pixel took 290 ns and a Gaussian 344 ns: so both count alike.
+counts as several keys. Time, memory and disk of such a cell are scaled by the pixels of a view, and
+its time by the steps and threads too. Of several equally near cells the median counts. A store
+without finished cells gives no estimate.
 """
 
 from __future__ import annotations
 
 import heapq
-from collections import Counter
 from contextlib import suppress
 from dataclasses import asdict, astuple, dataclass
 from datetime import datetime
 from functools import cache
-from statistics import median
-from typing import TYPE_CHECKING, Any, NamedTuple
+from statistics import fmean, median
+from typing import TYPE_CHECKING, Any
 
 from xrgs.errors import StoreError, XrgsError
 from xrgs.mixture import saved_variant
-from xrgs.mixture.degradations import resolve_degradation
 from xrgs.mixture.paths import trimmed_folder
 from xrgs.splat.backend import resolve_backend
-from xrgs.splat.settings import KEPT_BYTES, NOMINAL_STEPS
 from xrgs.store.provenance import processor, this_processor
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Iterator, Mapping
     from pathlib import Path
 
     from xrgs.config import Conf
@@ -43,7 +32,8 @@ if TYPE_CHECKING:
     from xrgs.store.store import Store
 
 #: Gaussians of a cell for each pixel of its largest view, mean over the steps, where no finished
-#: cell tells.
+#: cell tells. In least squares of 111 cells of 2,000 steps at 500 px on one thread of an AMD EPYC
+#: (November 2026), a rendered pixel took 290 ns of a step and a Gaussian 344 ns: both count alike.
 GAUSSIANS_OF_A_PIXEL = 0.5
 #: Number of finished cells that are read, the newest first; more would take long and help little.
 _MAX_CELLS = 500
@@ -52,29 +42,8 @@ _MAX_CELLS = 500
 TORCH_SLOWDOWN = 50.0
 #: The most seconds that count as loading and scoring. A store that was copied has other dates.
 _MAX_OVERHEAD_S = 600.0
-#: A photograph at 1/k of its size keeps about k to the minus this of its spectrum. With two thirds
-#: the pixels that 140 cells with `resolution_schedule` rendered are estimated to within 12 %
-#: (November 2026).
-_SPECTRUM_DECAY = 2 / 3
-#: `resolution_schedule` reduces photographs by no more than this.
-_MOST_REDUCED = 8
-#: Number of steps, evenly spaced, at which the schedules of components are looked at.
-_SAMPLES = 30
-#: Bytes of a pixel in 8 bits, and in float32.
-_RGB_BYTES, _FLOAT_RGB_BYTES = 3, 12
 #: Keys that count as this many differing ones, in the distance of two cells.
 _OTHER_VARIANT, _OTHER_PROCESSOR, _OTHER_BACKEND = 3, 5, 100
-
-
-class _Sizes(NamedTuple):
-    """Sizes of the training views of a cell."""
-
-    pixels: float
-    """Pixels that a step renders, mean over the steps."""
-    largest: int
-    """Pixels of the largest training view, the unit of budgets of Gaussians."""
-    held_bytes: int
-    """What training holds of all photographs: 8 bits of them, and moments up to `KEPT_BYTES`."""
 
 
 @dataclass(frozen=True)
@@ -101,14 +70,12 @@ class _Finished:
 
     settings: frozenset[tuple[str, str]]
     variant_id: str
-    sizes: _Sizes
+    pixels: float
+    """Pixels of the training views, mean over the steps."""
     steps: int
     threads: int
     backend: str
     processor: str
-    gaussians: int
-    mean_gaussians: float
-    """Mean over the steps."""
     training_s: float
     overhead_s: float
     memory_bytes: float
@@ -136,20 +103,18 @@ class CostEstimator:
     def _read(self, cell: CellFolder) -> _Finished:
         conf, status = cell.config(), cell.status()
         summary, made = cell.summary(), cell.provenance()
-        variant_id, steps = cell.identity().variant, summary.steps
+        variant_id = cell.identity().variant
         ended, started = cell.status_file.stat().st_mtime, datetime.fromisoformat(made.started)
         overhead = ended - started.timestamp() - summary.training_time_s
         files = {**status.files, **status.trimmed}
         return _Finished(
             settings=_settings(conf),
             variant_id=variant_id,
-            sizes=_sizes(self._store.variants, variant_id, conf),
-            steps=steps,
+            pixels=_pixels(self._store.variants, variant_id, conf)[0],
+            steps=summary.steps,
             threads=made.threads,
             backend=made.backend,
             processor=processor(made),
-            gaussians=summary.gaussians,
-            mean_gaussians=summary.work.get("gaussians", summary.gaussians * steps) / steps,
             training_s=summary.training_time_s,
             overhead_s=overhead if 0 < overhead < _MAX_OVERHEAD_S else 0.0,
             memory_bytes=summary.peak_rss_bytes or 0.0,
@@ -183,45 +148,25 @@ class CostEstimator:
         distances = [distance(past) for past in finished]
         least = min(distances)
         nearest = [p for p, far in zip(finished, distances, strict=True) if far == least]
-        sizes = None
+        pixels = None
         if variant_id is not None:
             with suppress(StoreError):
-                sizes = _sizes(self._store.variants, variant_id, conf)
+                pixels = _pixels(self._store.variants, variant_id, conf)[0]
         # Of a variant that is not built yet, the views of the cell's own variant are taken.
-        costs = [_scaled(past, conf, sizes or past.sizes, threads, backend) for past in nearest]
+        costs = [_scaled(past, conf, pixels or past.pixels, threads, backend) for past in nearest]
         return Cost(*(median(values) for values in zip(*map(astuple, costs), strict=True)))
 
 
-def _scaled(past: _Finished, conf: Conf, sizes: _Sizes, threads: int, backend: str) -> Cost:
+def _scaled(past: _Finished, conf: Conf, pixels: float, threads: int, backend: str) -> Cost:
     """Scale the cost of a finished cell to a planned one."""
-    mean, last = _gaussians(past, conf, sizes.largest)
-    step = (sizes.pixels + mean) / (past.sizes.pixels + past.mean_gaussians)
+    ratio = pixels / past.pixels
+    training = past.training_s * conf.train.steps / past.steps * ratio
     if backend != past.backend:
-        step *= TORCH_SLOWDOWN if backend == "torch" else 1 / TORCH_SLOWDOWN
-    training = past.training_s * conf.train.steps / past.steps * step
+        training *= TORCH_SLOWDOWN if backend == "torch" else 1 / TORCH_SLOWDOWN
     if backend != "gsplat":
         training *= max(1, past.threads) / max(1, threads)
-    overhead = past.overhead_s * sizes.largest / past.sizes.largest
-    seconds = training + overhead
-    # A cell of an older version held more of its photographs; then this is too much.
-    memory = (past.memory_bytes - past.sizes.held_bytes) * step + sizes.held_bytes
-    return Cost(seconds, overhead, memory, past.disk_bytes * last / max(1, past.gaussians))
-
-
-def _gaussians(past: _Finished, conf: Conf, largest: int) -> tuple[float, float]:
-    """Return the Gaussians that a cell is expected to have: the mean over the steps, and the last.
-
-    `splat.densify.budget` limits them from the beginning. `components.natural_selection` lets them
-    grow first and then takes some away: the mean is half way between.
-    """
-    growth = _within(conf.splat.densify.budget * largest, past.gaussians)
-    kept = min(growth, _within(conf.components.natural_selection.budget * largest, past.gaussians))
-    return past.mean_gaussians * (growth + kept) / 2, past.gaussians * kept
-
-
-def _within(budget: float, count: int) -> float:
-    """Return which share of a count of Gaussians a budget leaves; a budget of 0 leaves all."""
-    return min(1.0, budget / max(1, count)) if budget else 1.0
+    overhead = past.overhead_s * ratio
+    return Cost(training + overhead, overhead, past.memory_bytes * ratio, past.disk_bytes * ratio)
 
 
 def _settings(conf: Conf) -> frozenset[tuple[str, str]]:
@@ -251,16 +196,16 @@ def read_views(variants: Path, variant_id: str) -> tuple[ViewEntry, ...]:
     return saved_variant.read_manifest(folder).views
 
 
-def _sizes(variants: Path, variant_id: str, conf: Conf) -> _Sizes:
-    """Return the sizes of a cell's training views.
+def _pixels(variants: Path, variant_id: str, conf: Conf) -> tuple[float, int]:
+    """Return the pixels of a cell's training views: the mean over the steps, and the largest.
 
     Raises:
         StoreError: The variant's list of views can't be read, or has none that is trained on.
     """
     views = read_views(variants, variant_id)
-    tag = {"hr_only": "HR", "lr_only": "LR"}.get(conf.train.views)
     # Originals take the place of degraded views.
     splits = ("train", "original") if conf.train.views == "all_hr" else ("train",)
+    tag = {"hr_only": "HR", "lr_only": "LR"}.get(conf.train.views)
     by_name = {
         view.name: view
         for split in splits
@@ -269,64 +214,25 @@ def _sizes(variants: Path, variant_id: str, conf: Conf) -> _Sizes:
     }
     if not by_name:
         raise StoreError(f"variant {variant_id}: no view for train.views={conf.train.views}")
-    training = tuple(by_name.values())
-    pixels = [view.width * view.height for view in training]
-    tested = sum(view.width * view.height for view in views if view.split == "test")
-    moments = min(KEPT_BYTES, 2 * _FLOAT_RGB_BYTES * sum(pixels))  # mean and variance
-    held = _RGB_BYTES * (sum(pixels) + tested) + moments
-    return _Sizes(_rendered(training, conf), max(pixels), held)
+    hr, lr = (
+        [view.width * view.height for view in by_name.values() if view.tag == tag]
+        for tag in ("HR", "LR")
+    )
+    share = len(hr) / len(by_name)
+    if hr and lr:
+        share = max(share, conf.train.hr_share)
+    mean = sum(drawn * fmean(of) for of, drawn in ((hr, share), (lr, 1 - share)) if of)
+    return mean, max(hr + lr)
 
 
 def units_of_a_step(store: Store, conf: Conf, variant_id: str) -> float:
-    """Return the rendered pixels and the Gaussians of a step of a cell, mean over the steps.
+    """Return the pixels and the Gaussians of a step of a cell, mean over the steps.
 
     Raises:
         StoreError: The variant's list of views can't be read.
     """
-    sizes = _sizes(store.variants, variant_id, conf)
-    return sizes.pixels + GAUSSIANS_OF_A_PIXEL * sizes.largest
-
-
-def _rendered(views: Sequence[ViewEntry], conf: Conf) -> float:
-    """Return the pixels that a step renders, mean over the steps."""
-    hr, lr = ([view for view in views if view.tag == tag] for tag in ("HR", "LR"))
-    # Validation holds some HR views out, and leaves two.
-    trained_hr = max(min(2, len(hr)), len(hr) * (1 - conf.train.validation))
-    share = trained_hr / (trained_hr + len(lr))
-    if hr and lr:
-        share = max(share, conf.train.hr_share)
-    at_steps = [(n + 0.5) * NOMINAL_STEPS / _SAMPLES for n in range(_SAMPLES)]
-    return sum(
-        drawn * sum(_render_sizes(of_tag, conf, step)) / len(of_tag)
-        for of_tag, drawn in ((hr, share), (lr, 1 - share))
-        if of_tag
-        for step in at_steps
-    ) / len(at_steps)
-
-
-def _render_sizes(views: Sequence[ViewEntry], conf: Conf, step: float) -> Iterator[float]:
-    """Yield the pixels of the render of each view, as the components ask for at a nominal step."""
-    larger, reduced = conf.components.supersampled, _reduced(conf, step)
-    most = larger.late_factor if step >= larger.late_from else larger.factor
-    blurred = conf.components.formation.widths != "none"
-    zoom = conf.variant.factor if resolve_degradation(conf.variant) == "digital_zoom" else 1
-    sizes = Counter(
-        (v.width * v.height, min(max(1, round(v.supersampling)), most), v.tag) for v in views
-    )
-    for (pixels, factor, tag), count in sizes.items():
-        scale = factor / reduced if tag == "HR" else float(factor)
-        if tag == "LR" and (factor > 1 or blurred):  # at the size of the pixels that it resolves
-            scale /= zoom
-        yield count * pixels * scale**2
-
-
-def _reduced(conf: Conf, step: float) -> int:
-    """Return how many times smaller `resolution_schedule` makes HR views at a nominal step."""
-    schedule = conf.components.resolution_schedule
-    if not (0 < schedule.start_share < 1 <= schedule.until):  # off, or refused by the training
-        return 1
-    kept = schedule.start_share ** max(0.0, 1 - step / schedule.until)
-    return min(_MOST_REDUCED, int(kept ** (-1 / _SPECTRUM_DECAY)))
+    mean, largest = _pixels(store.variants, variant_id, conf)
+    return mean + GAUSSIANS_OF_A_PIXEL * largest
 
 
 def _newest(store: Store) -> list[CellFolder]:

@@ -31,7 +31,7 @@ from xrgs.safeio.sanitize import counted, for_line
 from xrgs.splat.backend import resolve_backend
 from xrgs.store.attempts import plan_cell
 from xrgs.sweep.jobs import worker
-from xrgs.sweep.jobs.job import INTERRUPTED, STOPPED, UNKNOWN
+from xrgs.sweep.jobs.job import INTERRUPTED, STOPPED
 from xrgs.sweep.plan import expected_length
 from xrgs.sweep.session import SweepSession
 
@@ -334,8 +334,6 @@ class Launches:
                 log_line(f"{cell.name}: its job was asked to end; the next sweep continues it")
             return answer
         state = store.cell(str(cell.cell_id)).state().name
-        if state == "unknown":
-            return UNKNOWN
         if state == "unfinished":
             return self._after_silence(str(cell.cell_id), state)
         return "done" if state == "done" else "failed"
@@ -416,11 +414,11 @@ def _hand_over(cell: PlannedCell, threads: int, store: Store) -> list[str]:
         scene=replace(scene, path=path, masks=masks),
     )
     # Under the lease: another sweep may be training the cell, or have finished it, since the plan.
-    # A dead owner that this process has watched for long enough need not be watched by the job.
     held = lease.acquire(store.leases, cell.cell_id)
     if held is not None:
         try:
-            if store.cell(cell.cell_id).state(verify=False).name not in {"done", "unknown"}:
+            state = store.cell(cell.cell_id).state(verify=False)
+            if state.name != "done" and not state.unreadable:
                 plan_cell(store.cell(cell.cell_id), conf, cell.identity)
         finally:
             held.release()

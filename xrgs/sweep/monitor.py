@@ -313,9 +313,10 @@ class SweepMonitor:
             folder = self._folder(name)
             if (status := _stamp(folder.status_file)) is None or status == self._before[name]:
                 return ""
-            state = folder.state(verify=False).name
-            if state == "unknown":  # it is read again
+            found = folder.state(verify=False)
+            if found.unreadable:  # it is read again
                 return ""
+            state = found.name
             if state == "done":
                 self._slowness.end(cell)
             self._ended[name] = "done" if state == "done" else "failed"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from xrgs.errors import XrgsError
 from xrgs.mixture.paths import TO_TRY
@@ -85,11 +85,6 @@ class PlannedCell:
         names = label.replace("+", ",")
         changes = (f"+ablation={names if names == label else f'[{names}]'}",)
         return replace(self.spec, label=label, changes=() if label == BASELINE else changes)
-
-    @property
-    def unknown(self) -> bool:
-        """Whether a file of the store can't be read now, so that the cell is left alone."""
-        return self.error is None and self.state.name == "unknown"
 
     @property
     def not_placed(self) -> bool:
@@ -195,7 +190,7 @@ def ready(
         tried: Ids of cells that this sweep has trained already, with whatever outcome.
         retry: Train cells again that failed in an earlier sweep.
     """
-    left_alone = {"done", "running", "unknown"} | (set() if retry else {"failed"})
+    left_alone = {"done", "running"} | (set() if retry else {"failed"})
     return {
         cell.cell_id: cell
         for cell in plan
@@ -220,9 +215,8 @@ def describe(plan: Sequence[PlannedCell]) -> str:
             reason = "the same"
         elif reason:
             said.add(reason)
-        missing = {"unknown": "variant unknown", "waits": "no count yet"}
-        cell_id = cell.cell_id or missing.get(state, "variant not built")
-        to_train = not cell.error and state not in {"done", "unknown"}
+        cell_id = cell.cell_id or ("no count yet" if state == "waits" else "variant not built")
+        to_train = not cell.error and state != "done"
         time_left = format_duration(cell.seconds) if to_train else ""
         line = f"  {state:<10} {cell_id:<18} {time_left:>8}  {cell.name}"
         lines.append(f"{line}  ({reason})" if reason else line)
@@ -241,8 +235,6 @@ def _shown_state(cell: PlannedCell) -> tuple[str, str]:
     reason = cell.state.reason.partition("\n")[0]
     if cell.error:
         return "failed", cell.error
-    if cell.unknown:
-        return "unknown", f"{reason}; run the same command again"
     return "waits" if cell.waits else cell.state.name, reason
 
 
@@ -308,17 +300,13 @@ def unchanged(plan: Sequence[PlannedCell]) -> list[str]:
 def will_fail(plan: Sequence[PlannedCell]) -> bool:
     """Return whether a run of this plan is known to end with code 1."""
     retry = plan[0].conf.retry == "failed"
-    return any(
-        cell.error or cell.unknown or (cell.state.name == "failed" and not retry) for cell in plan
-    )
+    return any(cell.error or (cell.state.name == "failed" and not retry) for cell in plan)
 
 
 def left_to_train(plan: Sequence[PlannedCell]) -> list[PlannedCell]:
     """Return the cells to train, with cells that still lack their variant or count."""
     retry = plan[0].conf.retry == "failed"
-    unidentified = [
-        cell for cell in plan if cell.cell_id is None and not cell.error and not cell.unknown
-    ]
+    unidentified = [cell for cell in plan if cell.cell_id is None and not cell.error]
     return [*unidentified, *ready(plan, (), retry=retry).values()]
 
 
@@ -347,23 +335,11 @@ def record(plan: Sequence[PlannedCell]) -> list[RecordedCell]:
             seed=cell.conf.seed,
             variant_id=cell.variant_id,
             baseline_id=baselines.get(cell.spec.shared),
-            # A report reads the state of a cell with an id itself.
-            error=cell.state.reason if _lacks_id_for_now(cell) else cell.error,
-            state=_recorded_state(cell),
+            error=cell.error,
+            state="not placed" if cell.not_placed else None,
         )
         for cell in plan
     ]
-
-
-def _recorded_state(cell: PlannedCell) -> Literal["unknown", "not placed"] | None:
-    if _lacks_id_for_now(cell):
-        return "unknown"
-    return "not placed" if cell.not_placed else None
-
-
-def _lacks_id_for_now(cell: PlannedCell) -> bool:
-    """Return whether the cell has no id because a file can't be read now."""
-    return cell.cell_id is None and cell.unknown
 
 
 def _planned_id(cell: PlannedCell) -> str:

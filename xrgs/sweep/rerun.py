@@ -145,8 +145,6 @@ def _read(original: CellFolder) -> tuple[Conf, Identity, dict[str, Any]]:
         if not (original.path / name).is_file():
             raise XrgsError(f"rerun={original.path} is not a finished cell: it has no {name}")
     state = original.state()
-    if state.name == "unknown":
-        raise XrgsError(f"rerun={original.path}: {state.reason}")
     if state.name == "failed":
         reason = state.reason.partition("\n")[0]
         raise XrgsError(f"rerun={original.path}: the cell failed and has no results ({reason})")

@@ -142,7 +142,7 @@ def describe(status: StoreStatus) -> str:
     lines += [_disk(status.sizes), *_table(status.cells)]
     done = sorted((c for c in status.cells if c.state.name == "done"), key=lambda c: c.age_s or 0)
     lines += _named("done, the latest first:", [cell.name for cell in done], "xrgs-store list")
-    for state in ("running", "failed", "corrupt", "unknown", "unfinished"):
+    for state in ("running", "failed", "corrupt", "unfinished"):
         of_state = [cell for cell in status.cells if cell.state.name == state]
         lines += _named(f"{state}:", [_reason(cell) for cell in of_state])
     failed = [f"{key}  {scene}  {why}" for key, scene, why in status.failed_scenes]

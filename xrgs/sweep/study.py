@@ -35,7 +35,6 @@ from xrgs.safeio.files import is_transient
 from xrgs.safeio.hashing import digest, to_plain
 from xrgs.safeio.sanitize import for_line
 from xrgs.splat.settings import SSIM_WINDOW
-from xrgs.store.cell_folder import CellState
 from xrgs.store.store import Store, StoreGoneError
 from xrgs.sweep import build_variants, controls, launch, track
 from xrgs.sweep.axes import CellSpec, effective, expand
@@ -72,8 +71,6 @@ if TYPE_CHECKING:
 _NUMBER = re.compile(r"([\w.]+)=((?:0|[1-9]\d*)(?:\.\d+)?)")
 #: Seconds between two looks at the cells of other sweeps.
 _POLL_S = 2.0
-#: Number of looks at cells with a file that can't be read now, before they are left alone.
-_UNKNOWN_LOOKS = 5
 
 
 class Study:
@@ -207,7 +204,7 @@ class Study:
             StoreError: The store can't be written any more, or is no longer there.
         """
         conf = plan[0].conf
-        waiting_said, tried, looks = False, set[str](), 0
+        waiting_said, tried = False, set[str]()
         launches = launch.Launches(self._context, self._task, self._config)
         while True:
             store.check_not_gone()
@@ -215,8 +212,7 @@ class Study:
                 watcher.watch(plan)
             to_train = ready(plan, tried, retry=conf.retry == "failed")
             elsewhere = [cell for cell in plan if cell.state.name == "running"]
-            unknown = any(cell.unknown for cell in plan) and looks < _UNKNOWN_LOOKS
-            if not to_train and not elsewhere and not unknown:
+            if not to_train and not elsewhere:
                 launches.end()
                 return list(plan)
             outcomes = launches.launch(to_train.values(), store) if to_train else {}
@@ -224,8 +220,7 @@ class Study:
             begun = {cell_id for cell_id in to_train if outcomes[cell_id] not in not_begun}
             tried |= begun
             store.check_not_gone()
-            plan = self._identified(self._looked_again(plan, store), store)
-            looks += unknown and not begun
+            plan = self._identified(plan, store)
             if UNWRITABLE in outcomes.values():
                 raise StoreError(f"store={store.path} can't be written. {worker.NOTHING_LOST}")
             failed = conf.fail_fast and "failed" in outcomes.values()
@@ -286,7 +281,7 @@ class Study:
         try:
             count = store.cell(reference.cell_id).summary().gaussians
         except UnreadableError as error:
-            return replace(cell, state=CellState("unknown", f"it can't be read now: {error}"))
+            return replace(cell, error=str(error))
         changes = (*cell.spec.changes, f"components.count_matched.gaussians={count}")
         spec = replace(cell.spec, changes=changes)
         return replace(cell, spec=spec, conf=self._compose(spec))
@@ -328,26 +323,13 @@ class Study:
         cells = []
         for key, cell in zip(keys, plan, strict=True):
             found = results[key]
-            state = CellState("unknown", found.unknown) if found.unknown else CellState("absent")
             cells.append(
-                replace(
-                    cell,
-                    variant_id=found.id,
-                    error=found.error,
-                    remembered=found.remembered,
-                    state=state,
-                )
+                replace(cell, variant_id=found.id, error=found.error, remembered=found.remembered)
             )
             said |= dict.fromkeys(f"{scenes.label(cell.conf.scene)}: {n}" for n in found.notes)
         for line in () if self._brief else said:
             log_line(line)
         return cells
-
-    def _looked_again(self, plan: Sequence[PlannedCell], store: Store) -> list[PlannedCell]:
-        """Return the cells, after another look at the variants that could not be read before."""
-        unknown = [cell for cell in plan if cell.unknown and cell.variant_id is None]
-        found = {cell.spec: cell for cell in self._with_variants(unknown, store, allow_build=True)}
-        return [found.get(cell.spec, cell) for cell in plan]
 
 
 def check_sizes(conf: Conf) -> None:
@@ -401,7 +383,8 @@ def _tidy(done: set[str], store: Store) -> None:
         for cell_id in done:
             store.cell(cell_id).drop_checkpoint()
         for cell_id in done & lease.names(store.leases):
-            lease.free_if_dead(store.leases, cell_id)
+            if (held := lease.acquire(store.leases, cell_id)) is not None:
+                held.release()
 
 
 def _without_reference(cell: PlannedCell) -> PlannedCell:

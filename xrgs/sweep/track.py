@@ -17,7 +17,7 @@ from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.photos import scenes
 from xrgs.runtime.progress import log_line
 from xrgs.safeio.records import as_number, read_table
-from xrgs.sweep.trackers import SINKS, Run, mlflow_uri
+from xrgs.sweep.trackers import SINKS, Curves, Run, mlflow_uri
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -38,10 +38,6 @@ _PACKAGES = {"tensorboard": "tensorboard", "mlflow": "mlflow", "wandb": "wandb"}
 _POLL_S, _PAUSE_S = 2.0, 30.0
 #: Seconds that the end of a sweep waits for a tracker, for example for a server that is away.
 _END_S = 60.0
-
-#: The values of each step by the names of their series: `history/<column>`, `quality/<score>`
-#: (during training) and `score/<metric>` (of the end).
-Curves = dict[int, dict[str, float]]
 
 
 def check(kind: str) -> None:
@@ -170,12 +166,10 @@ class _Followed:
     def _send(self, found: Curves, kind: str, folder: Path) -> None:
         if self._sink is None:
             self._sink = SINKS[kind](run_of(self._planned, self.cell), folder)
-        new = [step for step in found if step > self._sink.sent]
-        for step in new:
-            self._sink.write(step, found[step])
+        new = {step: found[step] for step in found if step > self._sink.sent}
         if new:
-            self._sink.flush()
-            self._sink.sent = new[-1]
+            self._sink.send(new)
+            self._sink.sent = max(new)
 
     def close(self, state: str) -> None:
         """End the run of a cell that is `done`, `failed` or `stopped`."""

@@ -13,7 +13,7 @@ import os
 import time
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from xrgs.errors import StoreError
 from xrgs.evaluation.metrics import METRICS
@@ -25,6 +25,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from pathlib import Path
 
+#: The values of each step by the names of their series: `history/<column>`, `quality/<score>`
+#: (during training) and `score/<metric>` (of the end).
+Curves = dict[int, dict[str, float]]
 #: The names of a cell in the record of a sweep.
 NAMES = ("scene", "label", "condition", "variant_seed", "seed")
 #: The most parameters that MLflow takes at once.
@@ -56,24 +59,22 @@ class Run:
         return "--".join(map(for_file_name, filter(None, (*words, seeds, self.cell_id))))
 
 
-class Sink(Protocol):
+class Sink:
     """Takes the curves of one cell. Every method raises what its package, server or disk does."""
 
-    sent: int
+    sent = -1
     """The last step that is there; -1 where none is."""
 
-    def write(self, step: int, values: Mapping[str, float]) -> None:
-        """Add the values of a later step than `sent`, by the names of their series."""
-
-    def flush(self) -> None:
-        """Show what was added to people who look now."""
+    def send(self, new: Curves) -> None:
+        """Add steps that are all later than `sent`, so that people who look now see them."""
+        raise NotImplementedError
 
     def close(self, state: str) -> None:
         """End the run: the cell is `done`, `failed`, or was `stopped` and may go on later."""
 
 
-class _Table:
-    """One CSV file a cell, with one row for each value. It is replaced whole at each flush."""
+class _Table(Sink):
+    """One CSV file a cell, with one row for each value. It is replaced whole each time."""
 
     def __init__(self, run: Run, folder: Path) -> None:
         self._file = folder / f"{run.name}.csv"
@@ -83,21 +84,20 @@ class _Table:
             self._rows.extend([*row] for row in read_table(self._file)[1])
         self.sent = max((int(str(row[-2])) for row in self._rows), default=-1)
 
-    def write(self, step: int, values: Mapping[str, float]) -> None:
-        self._rows += [[*self._cell, for_csv(name), step, values[name]] for name in values]
-
-    def flush(self) -> None:
+    def send(self, new: Curves) -> None:
+        self._rows += [
+            [*self._cell, for_csv(name), step, value]
+            for step, values in new.items()
+            for name, value in values.items()
+        ]
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow(["cell_id", *NAMES, "series", "step", "value"])
         writer.writerows(self._rows)
         write_text(self._file, text.getvalue(), durable=False)
 
-    def close(self, state: str) -> None:
-        pass
 
-
-class _Events:
+class _Events(Sink):
     """One folder of TensorBoard's events a cell; a new file in it each time it is opened.
 
     Each step is one record, so that a step is there whole or not at all.
@@ -137,22 +137,18 @@ class _Events:
         content = Event(wall_time=time.time(), **event).SerializeToString()
         RecordWriter(self._records).write(content)
 
-    def write(self, step: int, values: Mapping[str, float]) -> None:
+    def send(self, new: Curves) -> None:
         from tensorboard.compat.proto.summary_pb2 import Summary
 
-        shown = [Summary.Value(tag=name, simple_value=value) for name, value in values.items()]
-        self._add(step=step, summary=Summary(value=shown))
-
-    def flush(self) -> None:
+        for step, values in new.items():
+            shown = [Summary.Value(tag=name, simple_value=value) for name, value in values.items()]
+            self._add(step=step, summary=Summary(value=shown))
         with self._file.open("ab") as stream:
             stream.write(self._records.getvalue())
         self._records = io.BytesIO()
 
-    def close(self, state: str) -> None:
-        pass
 
-
-class _MLflow:
+class _MLflow(Sink):
     """A run on the server that the environment names, or in the store's own SQLite file."""
 
     def __init__(self, run: Run, folder: Path) -> None:
@@ -187,15 +183,13 @@ class _MLflow:
         for at in range(0, len(params), _MAX_PARAMS):
             self._client.log_batch(run_id, params=params[at : at + _MAX_PARAMS])
 
-    def write(self, step: int, values: Mapping[str, float]) -> None:
+    def send(self, new: Curves) -> None:
         from mlflow.entities import Metric
 
         now = int(time.time() * 1000)
-        metrics = [Metric(name, value, now, step) for name, value in values.items()]
-        self._client.log_batch(self._id, metrics=metrics)
-
-    def flush(self) -> None:
-        pass
+        for step, values in new.items():
+            metrics = [Metric(name, value, now, step) for name, value in values.items()]
+            self._client.log_batch(self._id, metrics=metrics)
 
     def close(self, state: str) -> None:
         status = {"done": "FINISHED", "failed": "FAILED"}.get(state, "KILLED")
@@ -203,7 +197,7 @@ class _MLflow:
             self._client.set_terminated(self._id, status)
 
 
-class _Wandb:
+class _Wandb(Sink):
     """A run of Weights & Biases, whose id is the cell's.
 
     Its files can't be read back by its own package, so a file beside them keeps the last step.
@@ -213,10 +207,8 @@ class _Wandb:
         self._run, self._folder = run, folder
         self._opened: Any = None
         self._mark = folder / f"{run.cell_id}.json"
-        self.sent = -1
         with suppress(StoreError):  # there is none yet
             self.sent = read_struct(self._mark, int)
-        self._step = self.sent
 
     def _open(self) -> Any:
         import wandb
@@ -244,15 +236,13 @@ class _Wandb:
             settings=settings,
         )
 
-    def write(self, step: int, values: Mapping[str, float]) -> None:
+    def send(self, new: Curves) -> None:
         self._opened = self._opened or self._open()
-        self._opened.log(dict(values), step=step, commit=True)
-        self._step = step
-
-    def flush(self) -> None:
+        for step, values in new.items():
+            self._opened.log(values, step=step, commit=True)
         # A kill loses what W&B's own process has not written yet. It says nothing when it has.
         time.sleep(2 * _WANDB_S)
-        write_json(self._mark, self._step, durable=False)
+        write_json(self._mark, max(new), durable=False)
 
     def close(self, state: str) -> None:
         if self._opened is not None:

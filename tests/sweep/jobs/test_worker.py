@@ -14,14 +14,13 @@ from typing import Any
 
 import pytest
 
-from xrgs.errors import UnreadableError, XrgsError
+from xrgs.errors import XrgsError
 from xrgs.runtime import processes
 from xrgs.sweep.jobs import supervise, worker
 from xrgs.sweep.jobs.supervise import ProcessEnd
 from xrgs.sweep.jobs.worker import (
     AttemptLostError,
     InterruptedWorkError,
-    PassingError,
     UnwritableError,
     WorkerError,
     run_in_child,
@@ -57,9 +56,7 @@ def test_the_answer_of_the_child_is_returned(child: Callable[..., None]) -> None
         (ProcessEnd(0), {"error": "x", "errno": errno.ENOSPC}, UnwritableError, "x"),
         (ProcessEnd(0), {"error": "x", "errno": errno.EROFS}, UnwritableError, "x"),
         (ProcessEnd(0), {"error": "x", "errno": errno.ENOENT}, WorkerError, "x"),
-        (ProcessEnd(0), {"error": "x", "errno": errno.ESTALE}, PassingError, "x"),
-        (ProcessEnd(0), {"error": "x", "errno": errno.EACCES}, PassingError, "x"),
-        (ProcessEnd(0), {"error": "x", "unreadable": True}, PassingError, "x"),
+        (ProcessEnd(0), {"error": "x", "errno": errno.ESTALE}, WorkerError, "x"),
         (ProcessEnd(-signal.SIGTERM, "it took too long"), None, WorkerError, "it took too long"),
         (ProcessEnd(os.EX_IOERR), None, UnwritableError, "is the disk full?"),
         (ProcessEnd(3), None, WorkerError, "ended with exit code 3 before it answered"),
@@ -125,8 +122,6 @@ def test_the_child_answers_with_the_result_or_the_error(
         "result": {"twice": 2}
     }
     assert in_this_process(raising(XrgsError("no photographs"))) == {"error": "no photographs"}
-    sick = in_this_process(raising(UnreadableError("status.json: Input/output error")))
-    assert sick == {"error": "status.json: Input/output error", "unreadable": True}
     assert capsys.readouterr().err == ""
     full = in_this_process(raising(OSError(errno.ENOSPC, "no room")))
     assert full == {"error": "OSError: [Errno 28] no room", "errno": errno.ENOSPC}

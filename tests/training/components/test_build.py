@@ -120,6 +120,11 @@ def test_every_module_implements_a_component_or_is_shared() -> None:
     assert file_of("plugins") is None
 
 
+def test_every_hook_is_combined() -> None:
+    hooks = {name for name in vars(Component) if not name.startswith("_")}
+    assert hooks - vars(Components).keys() == {"settings_type", "from_settings"}
+
+
 def test_two_components_with_thresholds_are_refused() -> None:
     densify = Densify(DensifyConf(decide="per_class", lr_grow=2.0, lr_prune=2.0))
     assert Components([Component(), densify]).densification_groups(DensifySettings()) is not None

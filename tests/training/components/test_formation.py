@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -164,14 +163,11 @@ def test_a_render_without_gradients_teaches_nothing() -> None:
     ("of", "message"),
     [("tag", "0.30 px of blur across, 0.40 down"), ("view", "0.29 px of blur (other) to 0.35 px")],
 )
-def test_the_widths_are_said_at_the_end(
-    of: str, message: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_the_widths_are_said_at_the_end(of: str, message: str) -> None:
     blur = widths(of)
     blur.logs.values[0] = torch.tensor([0.4, 0.3]).log()
-    with caplog.at_level(logging.INFO):
-        blur.report()
-    assert f"LR views: {message}" in caplog.text
+    (found,) = blur.findings()
+    assert f"LR views: {message}" in found
 
 
 def test_another_kind_of_widths_is_refused(build: Build, on: ComponentsConf) -> None:

@@ -164,23 +164,20 @@ def test_a_reduced_view_is_rendered_larger_than_its_reduced_photograph(
     assert parts.to_photograph(render, step).shape == small.image.shape
 
 
-def test_the_number_of_views_with_each_factor_is_logged(
-    on: ComponentsConf, baseline: Conf, caplog: pytest.LogCaptureFixture
-) -> None:
-    caplog.set_level("INFO")
+def test_the_number_of_views_with_each_factor_is_said(on: ComponentsConf, baseline: Conf) -> None:
     needs = (1.0, 1.2, 2.0, 4.8)
     views = [
         replace(make_view("LR", torch.zeros(12, 15, 3)), name=f"{need}", supersampling=need)
         for need in needs
     ]
-    _built(on, baseline, "none", *views)
-    assert caplog.messages == ["supersampled: views at k times their size: 2 at 1, 2 at 2"]
+    found = _built(on, baseline, "none", *views).findings()
+    assert found == ["supersampled: views at k times their size: 2 at 1, 2 at 2"]
     on.supersampled.late_factor, on.supersampled.late_from = 5, 22_000
-    _built(on, baseline, "none", *views)
-    assert caplog.messages[1] == (
+    found = _built(on, baseline, "none", *views).findings()
+    assert found == [
         "supersampled: views at k times their size: 2 at 1, 2 at 2;"
         " from step 22000 on 2 at 1, 1 at 2, 1 at 5"
-    )
+    ]
 
 
 def test_gradients_reach_the_gaussians_through_the_larger_render(

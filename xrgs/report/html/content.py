@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from xrgs.report.collect import Sweep
     from xrgs.report.compare import Comparison
     from xrgs.report.context import Context
-    from xrgs.report.joined import JoinedStore
+    from xrgs.report.joined import ReportStore
     from xrgs.report.writing import Change
 
 #: What the cells have in common that the page shows side by side.
@@ -65,7 +65,7 @@ def shown(text: object) -> str:
     return for_line(str(text), MAX_CELL)
 
 
-def why(error: Exception, store: JoinedStore) -> str:
+def why(error: Exception, store: ReportStore) -> str:
     """Return the message of an error, without the paths of the stores."""
     return shown(store.without_paths(str(error)))
 
@@ -133,7 +133,7 @@ def add_curves(content: Content, quality: pd.DataFrame) -> None:
         content.curves.append(run_names(first) | {"label": shown(first["label"])} | columns)
 
 
-def add_history(content: Content, store: JoinedStore, comparison: Comparison) -> None:
+def add_history(content: Content, store: ReportStore, comparison: Comparison) -> None:
     """Add Gaussians over steps, and what each rule grew and pruned, of each finished cell."""
     for rows in runs(comparison):
         for _, row in rows[~rows["cell_id"].isin(store.external)].iterrows():

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
     from xrgs.mixture.views import Variant
     from xrgs.report.collect import Sweep
-    from xrgs.report.joined import JoinedStore
+    from xrgs.report.joined import ReportStore
     from xrgs.report.tables import Tables
 
 #: The largest page, in bytes, and what images and models may take of it.
@@ -56,7 +56,7 @@ _SCRIPTS = ("page.js", "tables.js", "views.js", "charts.js", "splats.js")
 
 def write_document(
     file: Path,
-    store: JoinedStore,
+    store: ReportStore,
     sweep: Sweep,
     tables: Tables,
     texts: Sequence[TextTable],
@@ -118,7 +118,7 @@ def _photographs(sweep: Sweep, *, alone: bool) -> list[tuple[str, list[str]]]:
     return [(shown(scene), [*map(for_line, notes)]) for scene, notes in found.items()]
 
 
-def _variants(store: JoinedStore, cells: pd.DataFrame, content: Content) -> dict[str, Variant]:
+def _variants(store: ReportStore, cells: pd.DataFrame, content: Content) -> dict[str, Variant]:
     """Load the variants of the finished cells; note those that can't be read."""
     found = {}
     for name in cells.loc[cells["state"] == "done", "variant_id"].unique():

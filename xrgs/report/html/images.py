@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from xrgs.mixture.views import Variant
     from xrgs.report.compare import Comparison
     from xrgs.report.html.content import Content
-    from xrgs.report.joined import JoinedStore
+    from xrgs.report.joined import ReportStore
     from xrgs.viewer.trained import TrainedScene, TrainingView
 
 #: The longer side that an image of the page has at most, px.
@@ -139,7 +139,7 @@ def error_map(photograph: Image.Image, render: Image.Image) -> Image.Image:
 
 def add_views(
     content: Content,
-    store: JoinedStore,
+    store: ReportStore,
     comparison: Comparison,
     views: pd.DataFrame,
     max_bytes: int,
@@ -180,14 +180,14 @@ def _title(entry: dict[str, Any]) -> str:
     return ", ".join(filter(None, (entry[key] for key in ("scene", "condition", "view"))))
 
 
-def _photograph(store: JoinedStore, cells: pd.DataFrame, view: str) -> Path:
+def _photograph(store: ReportStore, cells: pd.DataFrame, view: str) -> Path:
     """Return the file of the photograph of a view that cells are scored on."""
     first = cells.iloc[0]
     split = "train" if first["validation"] > 0 else "test"
     return store.variant(first["variant_id"]) / "images" / split / f"{view}.png"
 
 
-def _pixels(store: JoinedStore, cells: pd.DataFrame, view: str) -> int:
+def _pixels(store: ReportStore, cells: pd.DataFrame, view: str) -> int:
     """Return the number of pixels of a view's images, 0 where its photograph can't be read."""
     try:
         width, height = images.size(_photograph(store, cells, view))
@@ -223,7 +223,7 @@ def _entries(
 
 
 def _read(
-    content: Content, store: JoinedStore, cells: pd.DataFrame, view: str, title: str
+    content: Content, store: ReportStore, cells: pd.DataFrame, view: str, title: str
 ) -> tuple[Image.Image, dict[int, Image.Image]] | None:
     """Read a view's photograph, and its renders by the place of their cell.
 
@@ -267,7 +267,7 @@ def _add_images(
 
 def add_trained(
     content: Content,
-    store: JoinedStore,
+    store: ReportStore,
     comparison: Comparison,
     variants: dict[str, Variant],
     max_image_bytes: int,
@@ -329,7 +329,7 @@ def add_trained(
 
 
 def _load_models(
-    content: Content, store: JoinedStore, rows: pd.DataFrame, scene: TrainedScene
+    content: Content, store: ReportStore, rows: pd.DataFrame, scene: TrainedScene
 ) -> dict[str, str]:
     """Load the Gaussians of the cells of a run; return the labels of those that can be read."""
     labels: dict[str, str] = {}

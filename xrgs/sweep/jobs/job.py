@@ -15,7 +15,6 @@ from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.runtime import lease
 from xrgs.runtime.machine import gpus
 from xrgs.runtime.progress import log_line
-from xrgs.safeio.files import is_transient
 from xrgs.splat.backend import arithmetic
 from xrgs.store.attempts import begin_attempt
 from xrgs.store.identity import changed_code
@@ -35,9 +34,9 @@ if TYPE_CHECKING:
 
 #: Outcomes of a job other than the states of a cell. LOCKED: another sweep is training the cell.
 #: STOPPED: the sweep is over, or no further job may begin. UNWRITABLE: the store can't be written.
-#: GONE: the store is no longer there. UNKNOWN: a file can't be read now, and the cell was left.
+#: GONE: the store is no longer there.
 #: INTERRUPTED: a signal asked the cell's process to end, and the next sweep continues the cell.
-LOCKED, STOPPED, UNWRITABLE, GONE, UNKNOWN = "locked", "stopped", "unwritable", "gone", "unknown"
+LOCKED, STOPPED, UNWRITABLE, GONE = "locked", "stopped", "unwritable", "gone"
 INTERRUPTED = "interrupted"
 #: Reasons to begin no further job of a sweep, see `SweepSession.stop`.
 FAIL_FAST, STORE_FULL = "fail_fast, and a cell failed", "the store can't be written"
@@ -45,7 +44,6 @@ FAIL_FAST, STORE_FULL = "fail_fast, and a cell failed", "the store can't be writ
 _NO_FAULT = {
     worker.InterruptedWorkError: INTERRUPTED,
     worker.UnwritableError: UNWRITABLE,
-    UnreadableError: UNKNOWN,
 }
 
 
@@ -71,7 +69,7 @@ def run_job(session: SweepSession, store: Store, cell_id: str, name: str) -> str
         name: The cell's name for people.
 
     Returns:
-        The cell's state, or `LOCKED`, `STOPPED`, `UNWRITABLE`, `GONE`, `UNKNOWN` or `INTERRUPTED`.
+        The cell's state, or `LOCKED`, `STOPPED`, `UNWRITABLE`, `GONE` or `INTERRUPTED`.
 
     Raises:
         XrgsError: The installed code is not the planned one, or the variant of the cell is missing,
@@ -101,18 +99,12 @@ def run_job(session: SweepSession, store: Store, cell_id: str, name: str) -> str
 
 
 def _outcome_of(error: OSError | StoreError, store: Store) -> str:
-    """Return the outcome of a job after an error of the store; raise any other error again."""
+    """Return the outcome of a job after an OSError; raise an error of a damaged file again."""
     if store.is_gone:
         return GONE
-    if isinstance(error, UnreadableError):
-        return UNKNOWN
-    if isinstance(error, StoreError):
+    if isinstance(error, StoreError) and not isinstance(error, UnreadableError):
         raise error
-    if worker.unwritable(error):
-        return UNWRITABLE
-    if not is_transient(error):
-        raise error
-    return UNKNOWN
+    return UNWRITABLE if isinstance(error, OSError) and worker.unwritable(error) else "failed"
 
 
 def _run_under_lease(
@@ -133,9 +125,9 @@ def _run_under_lease(
         return LOCKED
     try:
         state = cell.state()
-        if state.name == "unknown":
+        if state.unreadable:
             log_line(f"{cell.id} is left: {state.reason}")
-        if state.name in {"done", "unknown"}:  # another sweep has finished it meanwhile
+        if state.unreadable or state.name == "done":  # another sweep has finished it meanwhile
             return state.name
         _check_code(name, cell.id, conf, identity)
         if not begin_attempt(cell, held.beat):
@@ -243,9 +235,10 @@ def _after_error(error: XrgsError, store: Store, folder: CellFolder, held: lease
         if isinstance(error, kind):
             log_line(f"{folder.id} is left: {error}")
             return outcome
-    state = folder.state().name
-    if state in {"done", "unknown"}:  # its process may have died after it had finished the cell
-        return state
+    state = folder.state()
+    # Its process may have died after it had finished the cell.
+    if state.name == "done" or state.unreadable:
+        return state.name
     folder.fail(str(error))
     log_line(f"{folder.id} failed: {error}")
     return "failed"

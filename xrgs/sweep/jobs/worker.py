@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from xrgs.errors import UnreadableError, XrgsError
+from xrgs.errors import XrgsError
 from xrgs.runtime import processes
 from xrgs.runtime.machine import set_portable_blas
 from xrgs.runtime.signals import StopRequest, StopSignal, end_by_sigterm, handlers_kept
@@ -42,8 +42,6 @@ NOTHING_LOST = (
 )
 #: Errors of a file system that takes no more writes.
 _UNWRITABLE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO})
-#: Errors that may be gone at the next try, and are no fault of the work.
-_PASSING = frozenset({errno.EACCES, errno.EPERM, errno.ESTALE, errno.ETIMEDOUT})
 #: Signals that ask a process to end: `scancel` and a cluster's time limits send them, and `kill`.
 _ASK_TO_END = frozenset(
     {signal.SIGHUP, signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2}
@@ -63,8 +61,6 @@ class Answer(msgspec.Struct, frozen=True):
     error: str | None = None
     """Why the work failed."""
     errno: int | None = None
-    unreadable: bool = False
-    """Whether a file could not be read now."""
     lost: bool = False
     """Whether another attempt at the cell has begun."""
 
@@ -83,10 +79,6 @@ class InterruptedWorkError(WorkerError):
 
 class UnwritableError(WorkerError):
     """The child could not write its files: the disk is full, read-only or broken."""
-
-
-class PassingError(WorkerError, UnreadableError):
-    """The child could not read a file now; its work is not known to be faulty."""
 
 
 def run_in_child(
@@ -114,7 +106,6 @@ def run_in_child(
         AttemptLostError: Another attempt at the cell has begun.
         InterruptedWorkError: A signal asked the child to end.
         UnwritableError: The child could not write its files.
-        PassingError: The child could not read a file now.
         WorkerError: The work failed; the message is the reason.
     """
     set_portable_blas()  # before the child loads it
@@ -145,9 +136,7 @@ def run_in_child(
 def _kind(answer: Answer) -> type[WorkerError]:
     if answer.lost:
         return AttemptLostError
-    if answer.errno in _UNWRITABLE:
-        return UnwritableError
-    return PassingError if answer.errno in _PASSING or answer.unreadable else WorkerError
+    return UnwritableError if answer.errno in _UNWRITABLE else WorkerError
 
 
 def cell_request(variant: Path, cell: CellFolder) -> dict[str, Any]:
@@ -264,8 +253,6 @@ def main(job: str, request: str, answer: str) -> None:
         result = Answer(_JOBS[job](given))
     except _LostError as error:
         result = Answer(error=str(error), lost=True)
-    except UnreadableError as error:
-        result = Answer(error=str(error), unreadable=True)
     except XrgsError as error:
         result = Answer(error=str(error))
     except Exception as error:

@@ -24,7 +24,8 @@ order:
 18. `after_step`: the Gaussians as the next step gets them.
 
 A step without a backward pass leaves out 10 and 11. After the last step training calls `bake` and
-`after_training`; `bake` also runs on a copy of the Gaussians wherever they are evaluated.
+`after_training`; `bake` also runs on a copy of the Gaussians wherever they are evaluated. Then the
+cell asks for `findings`.
 """
 
 from __future__ import annotations
@@ -396,6 +397,14 @@ class Component:
 
     def after_training(self, gaussians: Gaussians) -> None:
         """Look at the trained Gaussians before they are saved."""
+
+    def findings(self) -> list[str]:
+        """Return what training has found out about the photographs, for the cell's summary.
+
+        Returns:
+            Lines for people; each begins with the component's name, as in `floaters: ...`.
+        """
+        return []
 
     def state_dict(self) -> dict[str, Any]:
         """Return what the steps so far have changed in the component, for a checkpoint.

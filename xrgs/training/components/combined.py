@@ -11,98 +11,31 @@ from xrgs.splat.strategy.refinement import StrategyHooks
 from xrgs.training.components.base import Component
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
+    from collections.abc import Callable, Mapping
 
     from torch import Tensor
 
-    from xrgs.splat.cameras import Camera
-    from xrgs.splat.gaussians import ActivatedGaussians, Gaussians
     from xrgs.splat.settings import DensifySettings
     from xrgs.splat.strategy.base import Strategy
     from xrgs.splat.strategy.refinement import Groups
-    from xrgs.training.components.base import Step, TrainingView, ViewRenderer
+    from xrgs.training.components.base import Step
 
 
 #: The hooks by which components decide what densification grows.
 _GROWTH = ("densification_groups", "may_grow", "growth_scores")
 
 
-class Components(tuple[Component, ...]):
-    """The components that are on, in the order in which their hooks run; empty is the baseline."""
+class Components(tuple[Component, ...], Component):
+    """The components that are on, in the order in which their hooks run; empty is the baseline.
+
+    They are one component themselves: `_FOLDS` says how each hook combines their answers.
+    """
 
     __slots__ = ()
 
     def override(self, hook: str) -> bool:
         """Whether any component has a hook of its own; without one, the hook is the identity."""
         return any(_overrides(type(component), hook) for component in self)
-
-    def before_training(self, renderer: ViewRenderer) -> None:
-        """Call `Component.before_training` of each component in turn."""
-        for component in self:
-            component.before_training(renderer)
-
-    def allows_view(self, step: Step) -> bool:
-        """Whether every component allows the step's view."""
-        return all(component.allows_view(step) for component in self)
-
-    def training_views(
-        self, views: Mapping[str, TrainingView], step: Step
-    ) -> Mapping[str, TrainingView]:
-        """Apply `Component.training_views` of each component in turn."""
-        for component in self:
-            views = component.training_views(views, step)
-        return views
-
-    def before_render(self, activated: ActivatedGaussians, step: Step) -> ActivatedGaussians:
-        """Apply `Component.before_render` of each component in turn."""
-        for component in self:
-            activated = component.before_render(activated, step)
-        return activated
-
-    def render_camera(self, camera: Camera, step: Step) -> Camera:
-        """Apply `Component.render_camera` of each component in turn."""
-        for component in self:
-            camera = component.render_camera(camera, step)
-        return camera
-
-    def to_photograph(self, image: Tensor, step: Step) -> Tensor:
-        """Apply `Component.to_photograph` of each component, the last one first."""
-        for component in reversed(self):
-            image = component.to_photograph(image, step)
-        return image
-
-    def match_colors(self, image: Tensor, step: Step) -> Tensor:
-        """Apply `Component.match_colors` of each component in turn."""
-        for component in self:
-            image = component.match_colors(image, step)
-        return image
-
-    def pixel_weights(self, step: Step) -> Tensor | None:
-        """The product [H, W] of the components' pixel weights; None where none has any."""
-        return _combined(operator.mul, (c.pixel_weights(step) for c in self))
-
-    def modify_loss(self, loss: Tensor, image: Tensor, gaussians: Gaussians, step: Step) -> Tensor:
-        """Apply `Component.modify_loss` of each component in turn."""
-        for component in self:
-            loss = component.modify_loss(loss, image, gaussians, step)
-        return loss
-
-    def needs_backward(self, loss: Tensor, step: Step) -> bool:
-        """Whether every component needs the backward pass."""
-        # A list, so that every component is asked: some count their calls.
-        answers = [component.needs_backward(loss, step) for component in self]
-        return all(answers)
-
-    def after_backward(self, gaussians: Gaussians, step: Step) -> None:
-        """Call `Component.after_backward` of each component in turn."""
-        for component in self:
-            component.after_backward(gaussians, step)
-
-    def densification_grad2d(self, grad2d: Tensor, step: Step) -> Tensor:
-        """Apply `Component.densification_grad2d` of each component in turn."""
-        for component in self:
-            grad2d = component.densification_grad2d(grad2d, step)
-        return grad2d
 
     def densification_groups(self, settings: DensifySettings) -> Groups | None:
         """The groups of the one component that has any.
@@ -143,27 +76,6 @@ class Components(tuple[Component, ...]):
                 " splat.strategy=default"
             )
 
-    def may_grow(self, gaussians: Gaussians, step: Step) -> Tensor | None:
-        """Which Gaussians [N] every component lets grow; None where all of them may."""
-        return _combined(operator.and_, (c.may_grow(gaussians, step) for c in self))
-
-    def growth_scores(self, gaussians: Gaussians, step: Step) -> Tensor | None:
-        """The product [N] of the components' scores; None where none has any."""
-        return _combined(operator.mul, (c.growth_scores(gaussians, step) for c in self))
-
-    def to_prune(self, gaussians: Gaussians, step: Step) -> Tensor | None:
-        """Which Gaussians [N] any component removes; None where all of them stay."""
-        return _combined(operator.or_, (c.to_prune(gaussians, step) for c in self))
-
-    def after_step(self, gaussians: Gaussians, step: Step) -> None:
-        """Call `Component.after_step` of each component in turn."""
-        for component in self:
-            component.after_step(gaussians, step)
-
-    def opacity_attenuation(self, gaussians: Gaussians) -> Tensor | None:
-        """The product [N] of the components' attenuations; None where none has any."""
-        return _combined(operator.mul, (c.opacity_attenuation(gaussians) for c in self))
-
     def strategy_hooks(self, step: Step) -> StrategyHooks:
         """What the components decide about densification at a step."""
         return StrategyHooks(
@@ -171,21 +83,6 @@ class Components(tuple[Component, ...]):
             growth_scores=lambda gaussians: self.growth_scores(gaussians, step),
             opacity_attenuation=self.opacity_attenuation,
         )
-
-    def on_gaussians_changed(self, gaussians: Gaussians) -> None:
-        """Call `Component.on_gaussians_changed` of each component in turn."""
-        for component in self:
-            component.on_gaussians_changed(gaussians)
-
-    def bake(self, gaussians: Gaussians) -> None:
-        """Call `Component.bake` of each component in turn."""
-        for component in self:
-            component.bake(gaussians)
-
-    def after_training(self, gaussians: Gaussians) -> None:
-        """Call `Component.after_training` of each component in turn."""
-        for component in self:
-            component.after_training(gaussians)
 
     def state_dict(self) -> dict[str, Any]:
         """The states of the components that have one, by position and class name."""
@@ -207,9 +104,80 @@ def _overrides(kind: type[Component], hook: str) -> bool:
     return getattr(kind, hook) is not getattr(Component, hook)
 
 
-def _combined(
-    combine: Callable[[Tensor, Tensor], Tensor], answers: Iterable[Tensor | None]
+def _call(hooks: list[Callable[..., None]], *arguments: Any) -> None:
+    """Call each hook in turn."""
+    for hook in hooks:
+        hook(*arguments)
+
+
+def _apply(hooks: list[Callable[..., Any]], value: Any, *arguments: Any) -> Any:
+    """Change a value by each hook in turn."""
+    for hook in hooks:
+        value = hook(value, *arguments)
+    return value
+
+
+def _apply_reversed(hooks: list[Callable[..., Any]], value: Any, *arguments: Any) -> Any:
+    """Change a value by each hook, the last one first."""
+    return _apply(hooks[::-1], value, *arguments)
+
+
+def _all(hooks: list[Callable[..., bool]], *arguments: Any) -> bool:
+    """Whether all hooks say yes. Every one is asked: some count their calls."""
+    answers = [hook(*arguments) for hook in hooks]
+    return all(answers)
+
+
+def _reduce(
+    combine: Callable[[Tensor, Tensor], Tensor],
+    hooks: list[Callable[..., Tensor | None]],
+    *arguments: Any,
 ) -> Tensor | None:
-    """Reduce the answers that are not None; None where there is none."""
-    given = [answer for answer in answers if answer is not None]
-    return functools.reduce(combine, given) if given else None
+    """Combine the answers that are not None; None where there is none."""
+    answers = [answer for hook in hooks if (answer := hook(*arguments)) is not None]
+    return functools.reduce(combine, answers) if answers else None
+
+
+def _joined(hooks: list[Callable[..., list[str]]]) -> list[str]:
+    """Join the lists of all hooks."""
+    return [line for hook in hooks for line in hook()]
+
+
+#: How the components' answers become one, by the hook.
+_FOLDS: dict[str, Callable[..., Any]] = {
+    "before_training": _call,
+    "allows_view": _all,
+    "training_views": _apply,
+    "before_render": _apply,
+    "render_camera": _apply,
+    "to_photograph": _apply_reversed,
+    "match_colors": _apply,
+    "pixel_weights": functools.partial(_reduce, operator.mul),
+    "modify_loss": _apply,
+    "needs_backward": _all,
+    "after_backward": _call,
+    "densification_grad2d": _apply,
+    "may_grow": functools.partial(_reduce, operator.and_),
+    "growth_scores": functools.partial(_reduce, operator.mul),
+    "to_prune": functools.partial(_reduce, operator.or_),
+    "after_step": _call,
+    "opacity_attenuation": functools.partial(_reduce, operator.mul),
+    "on_gaussians_changed": _call,
+    "bake": _call,
+    "after_training": _call,
+    "findings": _joined,
+}
+
+
+def _combined(name: str, fold: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the method of `Components` for a hook."""
+
+    @functools.wraps(getattr(Component, name))
+    def combined(self: Components, *arguments: Any) -> Any:
+        return fold([getattr(component, name) for component in self], *arguments)
+
+    return combined
+
+
+for _name, _fold in _FOLDS.items():
+    setattr(Components, _name, _combined(_name, _fold))

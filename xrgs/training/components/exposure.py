@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Self
@@ -23,8 +22,6 @@ from xrgs.training.components.base import (
 if TYPE_CHECKING:
     from xrgs.config import ExposureConf
     from xrgs.splat.gaussians import Gaussians
-
-_log = logging.getLogger(__name__)
 
 
 class Exposure(Component):
@@ -124,15 +121,14 @@ class Exposure(Component):
         maps -= sum(maps[i] for i in self.reference) / len(self.reference)
         self.drawn = None
 
-    def after_training(self, gaussians: Gaussians) -> None:
-        """Log the smallest and the largest gain with the names of the photographs."""
-        del gaussians
+    def findings(self) -> list[str]:
+        """Return the smallest and the largest gain with the names of the photographs."""
         gains = {name: _gain(self.map_of(name)) for name in self.names}
         low, high = min(gains, key=lambda n: gains[n]), max(gains, key=lambda n: gains[n])
-        _log.info(
-            "exposure: the gains of the photographs are %.3f (%s) to %.3f (%s)",
-            *(gains[low], low, gains[high], high),
-        )
+        return [
+            f"exposure: the gains of the photographs are {gains[low]:.3f} ({low}) to"
+            f" {gains[high]:.3f} ({high})"
+        ]
 
     def state_dict(self) -> dict[str, Any]:
         """Return the maps and the state of their optimizer."""

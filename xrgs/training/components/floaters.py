@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Self
 
@@ -23,8 +22,6 @@ if TYPE_CHECKING:
     from xrgs.splat.cameras import Camera
     from xrgs.splat.gaussians import Gaussians
     from xrgs.splat.settings import DensifySettings
-
-_log = logging.getLogger(__name__)
 
 _NEAREST = 0.01
 """The share of a view's SfM points that are nearer than its near depth. A minimum would be the
@@ -146,11 +143,11 @@ class Floaters(Component):
         self.removed += int(too_near.sum())
         return too_near
 
-    def after_training(self, gaussians: Gaussians) -> None:
-        """Log how many Gaussians have been removed."""
-        del gaussians
-        if self.settings.near_share:
-            _log.info("floaters: %d Gaussians close to a camera were removed", self.removed)
+    def findings(self) -> list[str]:
+        """Return how many Gaussians have been removed."""
+        if not self.settings.near_share:
+            return []
+        return [f"floaters: {self.removed} Gaussians close to a camera were removed"]
 
     def state_dict(self) -> dict[str, Any]:
         """Return the number of removed Gaussians; all else follows from the views and the step."""

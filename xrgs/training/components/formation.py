@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -15,8 +14,6 @@ from xrgs.training.components.adam import RowAdam
 if TYPE_CHECKING:
     from xrgs.config import FormationConf
     from xrgs.training.components.base import Step, TrainingView
-
-_log = logging.getLogger(__name__)
 
 BOX = math.sqrt(1 / 12)
 """Standard deviation of a box as wide as a pixel, px: what a sensor's pixel blurs at the least."""
@@ -96,20 +93,19 @@ class BlurWidths:
         self.logs.update(self.rows[step.view.name], gradient, self.settings.lr)
         self.drawn = None
 
-    def report(self) -> None:
-        """Log the widths, or the smallest and the largest where each view has its own."""
+    def findings(self) -> list[str]:
+        """Return the widths, or the smallest and the largest where each view has its own."""
         if not self.rows:
-            return
+            return []
         blurs = {name: math.hypot(*self.of(name)) / math.sqrt(2) for name in self.rows}
         low, high = min(blurs, key=lambda n: blurs[n]), max(blurs, key=lambda n: blurs[n])
         if self.settings.widths == "tag":
             down, across = self.of(low)
-            _log.info("formation: LR views: %.2f px of blur across, %.2f down", across, down)
-        else:
-            _log.info(
-                "formation: LR views: %.2f px of blur (%s) to %.2f px (%s)",
-                *(blurs[low], low, blurs[high], high),
-            )
+            return [f"formation: LR views: {across:.2f} px of blur across, {down:.2f} down"]
+        return [
+            f"formation: LR views: {blurs[low]:.2f} px of blur ({low}) to {blurs[high]:.2f} px"
+            f" ({high})"
+        ]
 
     def state_dict(self) -> dict[str, Any]:
         """Return the logarithms of the widths and the state of their optimizer."""

@@ -3,40 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Self
+from dataclasses import replace
+from typing import TYPE_CHECKING, Self, cast
 
 import torch
 from torch import Tensor
 
 from xrgs.errors import XrgsError
 from xrgs.photos import masks
-from xrgs.splat.cameras import Camera
 from xrgs.splat.loss import WINDOW
 from xrgs.splat.resample import resize
 from xrgs.training.components.base import Component, Step, TrainingSetup, TrainingView
 
 if TYPE_CHECKING:
     from xrgs.config import ResolutionScheduleConf
+    from xrgs.training.dataset import LoadedView
 
 _LARGEST_FACTOR = 8
 """As in the authors' code."""
-
-
-@dataclass(frozen=True)
-class _ReducedView:
-    """An HR view with fewer pixels."""
-
-    name: str
-    tag: str
-    sampling_rate: float
-    camera: Camera
-    image: Tensor
-    """[h, w, 3] at the camera's size."""
-    mask: Tensor | None
-    """[h, w] bool, True for a pixel that is used; None uses all."""
-    supersampling: float
-    """The need of the view with all its pixels."""
 
 
 class ResolutionSchedule(Component):
@@ -148,7 +132,8 @@ class ResolutionSchedule(Component):
         needed = self.settings.start_share**left
         return max(factor for factor, kept in self.kept.items() if kept >= needed)
 
-    def _reduce(self, view: TrainingView, factor: int) -> _ReducedView:
+    def _reduce(self, view: TrainingView, factor: int) -> TrainingView:
+        """Return an HR view with fewer pixels; its `need` is that of the view with all of them."""
         width, height = round(view.camera.width / factor), round(view.camera.height / factor)
         image = resize(view.image, height, width, backend=self.backend)
         camera = view.camera.resized(width, height)
@@ -156,9 +141,7 @@ class ResolutionSchedule(Component):
         if view.mask is not None:
             resized = masks.resized(view.mask.cpu().numpy(), width, height)
             mask = torch.from_numpy(resized).to(view.mask.device)
-        return _ReducedView(
-            view.name, view.tag, view.sampling_rate, camera, image, mask, view.supersampling
-        )
+        return replace(cast("LoadedView", view), camera=camera, pixels=image, mask=mask)
 
 
 def kept_shares(images: Iterable[Tensor], factors: Iterable[int]) -> dict[int, float]:

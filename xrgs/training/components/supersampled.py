@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Self
@@ -24,9 +23,6 @@ from xrgs.training.components.formation import BlurWidths
 if TYPE_CHECKING:
     from xrgs.config import FormationConf, SupersampledConf
     from xrgs.splat.gaussians import Gaussians
-
-
-_log = logging.getLogger(__name__)
 
 
 class Supersampled(Component):
@@ -93,7 +89,7 @@ class Supersampled(Component):
         self.zoom = zoom if degradation == "digital_zoom" else 1
         low = [view for view in views if view.tag == "LR"]
         self.blur = BlurWidths(blur, low) if blur.widths != "none" else None
-        self._log_factors([view.supersampling for view in views])
+        self.needs = [view.need for view in views]
 
     @classmethod
     def from_settings(cls, settings: SupersampledConf, setup: TrainingSetup) -> Self | None:
@@ -145,11 +141,9 @@ class Supersampled(Component):
         if self.blur is not None:
             self.blur.learn(step)
 
-    def after_training(self, gaussians: Gaussians) -> None:
-        """Log the widths of the blur."""
-        del gaussians
-        if self.blur is not None:
-            self.blur.report()
+    def findings(self) -> list[str]:
+        """Return how many views have each k, and the widths of the blur that were learned."""
+        return [self._factors(), *(self.blur.findings() if self.blur is not None else ())]
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state of the blur; empty without one."""
@@ -175,18 +169,18 @@ class Supersampled(Component):
             return camera
         return camera.resized(camera.width // self.zoom, camera.height // self.zoom)
 
-    def _log_factors(self, needs: Sequence[float]) -> None:
-        """Log how many views have each k, and from `late_from` on, where that differs."""
+    def _factors(self) -> str:
+        """Return how many views have each k, and from `late_from` on, where that differs."""
         settings = self.settings
         early, late = (
             ", ".join(f"{count} at {k}" for k, count in sorted(counts.items()))
             for counts in (
-                Counter(_clamped(need, factor) for need in needs)
+                Counter(_clamped(need, factor) for need in self.needs)
                 for factor in (settings.factor, settings.late_factor)
             )
         )
         later = "" if late == early else f"; from step {settings.late_from} on {late}"
-        _log.info("supersampled: views at k times their size: %s%s", early, later)
+        return f"supersampled: views at k times their size: {early}{later}"
 
 
 def _clamped(need: float, factor: int) -> int:
