@@ -362,7 +362,7 @@ def test_a_file_from_before_a_key_was_added_takes_the_baselines_value(
 ) -> None:
     values = asdict(baseline)
     del (
-        values["components"]["skip_backward"],
+        values["components"]["resolution_schedule"],
         values["splat"]["raster"]["absgrad"],
         values["limits"],
         values["lpips"],
@@ -372,14 +372,26 @@ def test_a_file_from_before_a_key_was_added_takes_the_baselines_value(
     assert conf == baseline
     assert added == {
         "splat.raster.absgrad": False,
-        "components.skip_backward.share": 1.0,
-        "components.skip_backward.tolerance": 0.0,
-        "components.skip_backward.decay": 0.95,
-        "components.skip_backward.begin": 15_000,  # in the file, splat.densify.stop
+        "components.resolution_schedule.start_share": 1.0,
+        "components.resolution_schedule.until": 15_000,  # in the file, splat.densify.stop
         "limits.minutes": 0.0,
         "limits.memory_gb": 0.0,
         "lpips.fetch": False,  # by the variable of the environment that the tests set
     }
+
+
+@pytest.mark.parametrize("share", [1.0, 0.5])
+def test_a_file_from_before_a_component_was_moved_out_has_its_plugin(
+    share: float, baseline: Conf, tmp_path: Path
+) -> None:
+    values = asdict(baseline)
+    moved = {"share": share, "tolerance": 0.0, "decay": 0.95, "begin": 15_000}
+    values["components"]["skip_backward"] = moved
+    (file := tmp_path / "config.json").write_text(json.dumps(values))
+    conf, added = from_file(file)
+    assert conf.components.plugins == ({} if share == 1 else {"skip_backward": moved})
+    conf.components.plugins = {}
+    assert (conf, added) == (baseline, {})
 
 
 @pytest.mark.slow

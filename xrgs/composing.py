@@ -229,6 +229,11 @@ def _check_strategy(conf: Conf) -> None:
             )
 
 
+#: Former groups of `components` that are plugins of the same name now (`examples/arms`): the key
+#: that switched each on, and its value where it was off.
+_NOW_PLUGINS = {"skip_backward": ("share", 1.0)}
+
+
 def from_dict(values: Any) -> Conf:
     """Convert what `dataclasses.asdict` made of a config back to the config.
 
@@ -301,7 +306,8 @@ def from_file(file: Path) -> tuple[Conf, dict[str, Any]]:
     """Read the config that a cell's folder holds as JSON.
 
     A file from before a key was added lacks it. The key's value in `conf/config.yaml` is taken,
-    with which all that was added is off.
+    with which all that was added is off. A file from when a component of `examples/arms` was part
+    of xrgs has its settings elsewhere; they become those of the plugin where it was on.
 
     Args:
         file: The JSON file.
@@ -316,6 +322,7 @@ def from_file(file: Path) -> tuple[Conf, dict[str, Any]]:
     values = read_struct(file, Any)
     added = {}
     try:
+        _move_to_plugins(values)
         for group, name, key in _missing(values, Conf):
             value = reduce(getitem, key.split("."), _baseline())
             if value != _OPEN:
@@ -323,6 +330,18 @@ def from_file(file: Path) -> tuple[Conf, dict[str, Any]]:
         return from_dict(values), added
     except XrgsError as error:
         raise XrgsError(f"{file}: {error} (another version of xrgs may have written it)") from error
+
+
+def _move_to_plugins(values: Any) -> None:
+    """Move the settings of components that have become plugins, in place; what is off goes."""
+    components = values.get("components") if isinstance(values, dict) else None
+    if not isinstance(components, dict):
+        return  # `_missing` refuses it
+    for name, (key, off) in _NOW_PLUGINS.items():
+        if isinstance(settings := components.get(name), dict):
+            del components[name]
+            if settings.get(key, off) != off:
+                components.setdefault("plugins", {})[name] = settings
 
 
 @cache

@@ -190,16 +190,6 @@ class ResolutionScheduleConf:
 
 
 @dataclass(kw_only=True)
-class SkipBackwardConf:
-    """Steps without a backward pass after densification (SkipGS); not in the paper."""
-
-    share: float = off(1.0)
-    tolerance: float
-    decay: float
-    begin: int
-
-
-@dataclass(kw_only=True)
 class ConsistencyConf:
     """Cross-resolution consistency loss (paper, section 5.6)."""
 
@@ -326,7 +316,6 @@ class ComponentsConf:
     supersampled: SupersampledConf
     formation: FormationConf
     resolution_schedule: ResolutionScheduleConf
-    skip_backward: SkipBackwardConf
     consistency: ConsistencyConf
     adaptive_weighting: AdaptiveWeightingConf
     region_weighting: RegionWeightingConf

@@ -43,7 +43,6 @@ CASES = {
     "mip": ["+ablation=mip", "components.mip.every=7"],
     "mip_off_late": ["+ablation=mip_off_late", "components.mip.every=7"],
     "noise_weighting": ["+ablation=noise_weighting", "components.noise_weighting.begin=8000"],
-    "skip_backward": ["+ablation=skip_backward", "components.skip_backward.begin=3000"],
     "resolution_schedule": ["+ablation=resolution_schedule"],
     "harmonics_every": ["+ablation=harmonics_every"],
     "multiview_score": ["+ablation=multiview_score"],
@@ -60,7 +59,7 @@ CASES = {
     "count_matched": ["splat.densify.reset_every=50000"],
 }
 #: The others are marked slow.
-FAST = ("baseline", "xrgs", "mip", "skip_backward", "count_matched")
+FAST = ("baseline", "xrgs", "mip", "curriculum", "count_matched")
 
 
 class Kill(BaseException):

@@ -52,7 +52,6 @@ BUILT_IN: Mapping[str, ComponentEntry] = {
         "supersampled", "Supersampled", reads=("formation",), helpers=("formation", "adam")
     ),
     "resolution_schedule": ComponentEntry("resolution_schedule", "ResolutionSchedule"),
-    "skip_backward": ComponentEntry("skip_backward", "SkipBackward"),
     "multiview_score": ComponentEntry("view_scores", "MultiviewScore"),
     "error_score": ComponentEntry("view_scores", "ErrorScore"),
     "natural_selection": ComponentEntry("natural_selection", "NaturalSelection"),

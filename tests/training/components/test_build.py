@@ -34,7 +34,6 @@ from xrgs.training.components.noise_weighting import NoiseWeighting
 from xrgs.training.components.regularization import Regularization
 from xrgs.training.components.render_scale import RenderScale
 from xrgs.training.components.resolution_schedule import ResolutionSchedule
-from xrgs.training.components.skip_backward import SkipBackward
 from xrgs.training.components.supersampled import Supersampled
 from xrgs.training.components.view_scores import ErrorScore, MultiviewScore
 from xrgs.training.components.weighting import Weighting
@@ -56,7 +55,6 @@ ON: dict[str, tuple[Any, type[Component]]] = {
     "supersampled.late_factor": (2, Supersampled),
     "formation.widths": ("tag", Supersampled),
     "resolution_schedule.start_share": (0.5, ResolutionSchedule),
-    "skip_backward.share": (0.5, SkipBackward),
     "multiview_score.views": (2, MultiviewScore),
     "error_score.of": ("edges", ErrorScore),
     "natural_selection.budget": (0.5, NaturalSelection),
@@ -309,11 +307,6 @@ def test_what_is_imported(module: str, unused: set[str]) -> None:
         ("natural_selection.until", 30_001),
         ("floaters.near_share", -0.5),
         ("floaters.gradient_share", float("inf")),
-        ("skip_backward.share", -0.1),
-        ("skip_backward.share", 1.1),
-        ("skip_backward.decay", 1.0),
-        ("skip_backward.decay", -1.0),
-        ("skip_backward.tolerance", -0.1),
         ("resolution_schedule.start_share", 0.0),
         ("resolution_schedule.start_share", 1.5),
         ("resolution_schedule.until", 0),
