@@ -231,7 +231,12 @@ def _check_strategy(conf: Conf) -> None:
 
 #: Former groups of `components` that are plugins of the same name now (`examples/arms`): the key
 #: that switched each on, and its value where it was off.
-_NOW_PLUGINS = {"skip_backward": ("share", 1.0)}
+_NOW_PLUGINS = {
+    "error_score": ("of", "nothing"),
+    "multiview_score": ("views", 0),
+    "noise_weighting": ("floor", 1.0),
+    "skip_backward": ("share", 1.0),
+}
 
 
 def from_dict(values: Any) -> Conf:

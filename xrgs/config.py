@@ -228,37 +228,12 @@ class ContinuousWeightingConf:
 
 
 @dataclass(kw_only=True)
-class NoiseWeightingConf:
-    """A weight of an LR view by its own residual; not in the paper."""
-
-    floor: float = off(1.0)
-    begin: int
-
-
-@dataclass(kw_only=True)
 class MipConf:
     """Mip-Splatting's 3D smoothing filter; not in the paper."""
 
     variance: float = off(0.0)
     every: int
     until: int = off(30_000)
-
-
-@dataclass(kw_only=True)
-class MultiviewScoreConf:
-    """Growth only where several views have high errors (FastGS); not in the paper."""
-
-    views: int = off(0)
-    error: float
-    pixels: float
-
-
-@dataclass(kw_only=True)
-class ErrorScoreConf:
-    """What grows first where a budget leaves room for some (Improved-GS); not in the paper."""
-
-    of: str = off("nothing")
-    views: int
 
 
 @dataclass(kw_only=True)
@@ -321,10 +296,7 @@ class ComponentsConf:
     region_weighting: RegionWeightingConf
     hybrid_schedule: HybridScheduleConf
     continuous_weighting: ContinuousWeightingConf
-    noise_weighting: NoiseWeightingConf
     mip: MipConf
-    multiview_score: MultiviewScoreConf
-    error_score: ErrorScoreConf
     natural_selection: NaturalSelectionConf
     exposure: ExposureConf
     floaters: FloatersConf

@@ -42,10 +42,8 @@ CASES = {
     # Its rates are found anew between refinements too, or they would be new at every restart.
     "mip": ["+ablation=mip", "components.mip.every=7"],
     "mip_off_late": ["+ablation=mip_off_late", "components.mip.every=7"],
-    "noise_weighting": ["+ablation=noise_weighting", "components.noise_weighting.begin=8000"],
     "resolution_schedule": ["+ablation=resolution_schedule"],
     "harmonics_every": ["+ablation=harmonics_every"],
-    "multiview_score": ["+ablation=multiview_score"],
     "formation": ["+ablation=formation"],
     "exposure": ["+ablation=exposure"],
     "mcmc": ["+ablation=mcmc", "splat.densify.budget=0.03"],

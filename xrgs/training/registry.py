@@ -41,7 +41,6 @@ BUILT_IN: Mapping[str, ComponentEntry] = {
         ),
         helpers=("texture",),
     ),
-    "noise_weighting": ComponentEntry("noise_weighting", "NoiseWeighting"),
     "gradient_scaling": ComponentEntry("gradient_scaling", "GradientScaling"),
     "floaters": ComponentEntry("floaters", "Floaters"),
     "densify": ComponentEntry("densify", "Densify"),
@@ -52,8 +51,6 @@ BUILT_IN: Mapping[str, ComponentEntry] = {
         "supersampled", "Supersampled", reads=("formation",), helpers=("formation", "adam")
     ),
     "resolution_schedule": ComponentEntry("resolution_schedule", "ResolutionSchedule"),
-    "multiview_score": ComponentEntry("view_scores", "MultiviewScore"),
-    "error_score": ComponentEntry("view_scores", "ErrorScore"),
     "natural_selection": ComponentEntry("natural_selection", "NaturalSelection"),
     "exposure": ComponentEntry("exposure", "Exposure", helpers=("adam",)),
     "regularization": ComponentEntry("regularization", "Regularization"),
