@@ -380,18 +380,22 @@ def test_a_file_from_before_a_key_was_added_takes_the_baselines_value(
     }
 
 
-@pytest.mark.parametrize("share", [1.0, 0.5])
-def test_a_file_from_before_a_component_was_moved_out_has_its_plugin(
-    share: float, baseline: Conf, tmp_path: Path
+def test_a_file_from_before_components_were_moved_out_has_their_plugins(
+    baseline: Conf, tmp_path: Path
 ) -> None:
-    values = asdict(baseline)
-    moved = {"share": share, "tolerance": 0.0, "decay": 0.95, "begin": 15_000}
-    values["components"]["skip_backward"] = moved
-    (file := tmp_path / "config.json").write_text(json.dumps(values))
-    conf, added = from_file(file)
-    assert conf.components.plugins == ({} if share == 1 else {"skip_backward": moved})
-    conf.components.plugins = {}
-    assert (conf, added) == (baseline, {})
+    """Those that were on; what was off leaves nothing."""
+    skipping = {"share": 0.5, "tolerance": 0.0, "decay": 0.95, "begin": 15_000}
+    for on in (True, False):
+        values = asdict(baseline)
+        values["components"]["skip_backward"] = skipping | ({} if on else {"share": 1.0})
+        values["components"]["error_score"] = {"of": "nothing", "views": 10}
+        values["components"]["floaters"]["gradient_share"] = 0.5 if on else 0.0
+        (file := tmp_path / "config.json").write_text(json.dumps(values))
+        conf, added = from_file(file)
+        moved = {"skip_backward": skipping, "near_gradients": {"share": 0.5}}
+        assert conf.components.plugins == (moved if on else {})
+        conf.components.plugins = {}
+        assert (conf, added) == (baseline, {})
 
 
 @pytest.mark.slow

@@ -342,11 +342,17 @@ def _move_to_plugins(values: Any) -> None:
     components = values.get("components") if isinstance(values, dict) else None
     if not isinstance(components, dict):
         return  # `_missing` refuses it
+    moved = {}
     for name, (key, off) in _NOW_PLUGINS.items():
         if isinstance(settings := components.get(name), dict):
             del components[name]
             if settings.get(key, off) != off:
-                components.setdefault("plugins", {})[name] = settings
+                moved[name] = settings
+    floaters = components.get("floaters")
+    if isinstance(floaters, dict) and (share := floaters.pop("gradient_share", 0)):
+        moved["near_gradients"] = {"share": share}
+    if moved and isinstance(plugins := components.setdefault("plugins", {}), dict):
+        plugins.update(moved)
 
 
 @cache

@@ -257,10 +257,9 @@ class ExposureConf:
 
 @dataclass(kw_only=True)
 class FloatersConf:
-    """Guards against Gaussians in the empty space close to cameras."""
+    """A guard against Gaussians in the empty space close to cameras."""
 
     near_share: float = off(0.0)
-    gradient_share: float = off(0.0)
 
 
 @dataclass(kw_only=True)

@@ -52,7 +52,6 @@ _DEFAULT = (
     "components.formation.widths=tag",
     "components.exposure.mode=affine",
     "components.floaters.near_share=0.95",
-    "components.floaters.gradient_share=0.8",
     "components.densify.decide=per_class",
     "components.densify.lr_prune=1.01",
 )

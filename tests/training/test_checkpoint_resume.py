@@ -47,7 +47,7 @@ CASES = {
     "formation": ["+ablation=formation"],
     "exposure": ["+ablation=exposure"],
     "mcmc": ["+ablation=mcmc", "splat.densify.budget=0.03"],
-    "floaters": ["+ablation=[near_limit,near_gradients]", "components.floaters.near_share=1"],
+    "floaters": ["+ablation=near_limit", "components.floaters.near_share=1"],
     "natural_selection": [
         "+ablation=natural_selection",
         "components.natural_selection.budget=0.003",

@@ -21,7 +21,7 @@ def test_hidden_pixels_change_no_bit_of_training(tmp_path: Path, backend: str) -
         f"splat.backend={backend}",
         *("train.steps=9", "splat.densify.start=0", "splat.densify.every=10000"),
         *("splat.densify.grow_grad2d=1e-4", "splat.densify.budget=0.05"),
-        "+ablation=[multiview_score,error_score,noise_weighting,skip_backward]",
+        "+ablation=[multiview_score,error_score,noise_weighting,skip_backward,near_gradients]",
         "components.plugins.multiview_score.views=2",
     )
     results = [train(dataset.load(frozen(tmp_path / str(seed), seed)), conf) for seed in (1, 2)]

@@ -57,7 +57,6 @@ ON: dict[str, tuple[Any, type[Component]]] = {
     "regularization.opacity": (0.01, Regularization),
     "regularization.scale": (0.01, Regularization),
     "floaters.near_share": (0.5, Floaters),
-    "floaters.gradient_share": (0.5, Floaters),
     "continuous_weighting.gamma": (1.0, Weighting),
 }
 #: Keys that `off` declares too, with another value: they build no component by themselves. The
@@ -282,7 +281,6 @@ def test_what_is_imported(module: str, unused: set[str]) -> None:
         ("natural_selection.until", 16_000),
         ("natural_selection.until", 30_001),
         ("floaters.near_share", -0.5),
-        ("floaters.gradient_share", float("inf")),
         ("resolution_schedule.start_share", 0.0),
         ("resolution_schedule.start_share", 1.5),
         ("resolution_schedule.until", 0),
