@@ -390,9 +390,14 @@ def test_a_file_from_before_components_were_moved_out_has_their_plugins(
         values["components"]["skip_backward"] = skipping | ({} if on else {"share": 1.0})
         values["components"]["error_score"] = {"of": "nothing", "views": 10}
         values["components"]["floaters"]["gradient_share"] = 0.5 if on else 0.0
+        values["components"]["mip"] |= {"variance": 0.2 * on, "until": 20_000}
         (file := tmp_path / "config.json").write_text(json.dumps(values))
         conf, added = from_file(file)
-        moved = {"skip_backward": skipping, "near_gradients": {"share": 0.5}}
+        moved = {
+            "skip_backward": skipping,
+            "near_gradients": {"share": 0.5},
+            "mip_off_late": {"variance": 0.2, "every": 100, "until": 20_000},
+        }
         assert conf.components.plugins == (moved if on else {})
         conf.components.plugins = {}
         assert (conf, added) == (baseline, {})
@@ -461,7 +466,7 @@ class NewComponentsConf(ComponentsConf):
 def test_what_is_added_and_off_changes_no_identity(
     baseline: Conf, variance: float, every: int, late_from: int
 ) -> None:
-    old = replace(baseline.components, mip=MipConf(variance=variance, every=every, until=30_000))
+    old = replace(baseline.components, mip=MipConf(variance=variance, every=every))
     new = NewComponentsConf(
         **vars(old) | {"mip": NewMipConf(**vars(old.mip), added=3)},
         added=SupersampledConf(factor=1, late_factor=1, late_from=late_from),

@@ -233,7 +233,6 @@ class MipConf:
 
     variance: float = off(0.0)
     every: int
-    until: int = off(30_000)
 
 
 @dataclass(kw_only=True)

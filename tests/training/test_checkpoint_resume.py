@@ -41,7 +41,6 @@ CASES = {
     "budget": ["+ablation=budget", "splat.densify.budget=0.05"],
     # Its rates are found anew between refinements too, or they would be new at every restart.
     "mip": ["+ablation=mip", "components.mip.every=7"],
-    "mip_off_late": ["+ablation=mip_off_late", "components.mip.every=7"],
     "resolution_schedule": ["+ablation=resolution_schedule"],
     "harmonics_every": ["+ablation=harmonics_every"],
     "formation": ["+ablation=formation"],

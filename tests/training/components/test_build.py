@@ -64,7 +64,6 @@ ON: dict[str, tuple[Any, type[Component]]] = {
 #: without one; the last is read by `xrgs.training.count_matching`.
 OTHERS: dict[str, Any] = {
     "loss_weighting.stat_from": "unweighted",
-    "mip.until": 20_000,
     "natural_selection.drop_every": 100,
     "count_matched.gaussians": 100,
 }
@@ -273,7 +272,6 @@ def test_what_is_imported(module: str, unused: set[str]) -> None:
         ("continuous_weighting.gamma", -0.43),
         ("mip.variance", -0.2),
         ("mip.every", 0),
-        ("mip.until", 0),
         ("regularization.opacity", -0.01),
         ("regularization.scale", float("inf")),
         ("natural_selection.budget", -1.0),
