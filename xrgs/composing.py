@@ -229,14 +229,16 @@ def _check_strategy(conf: Conf) -> None:
             )
 
 
-#: Former groups of `components` that are plugins of the same name now (`examples/arms`): the key
-#: that switched each on, and its value where it was off.
-_NOW_PLUGINS = {
+#: Former groups of `components` that are plugins of the same name now: the key that switched each
+#: on, and its value where it was off.
+_FORMER_GROUPS = {
     "error_score": ("of", "nothing"),
     "multiview_score": ("views", 0),
     "noise_weighting": ("floor", 1.0),
     "skip_backward": ("share", 1.0),
 }
+#: The ablations that were part of xrgs and are in the package `examples/arms` now.
+ARMS = frozenset({*_FORMER_GROUPS, "mip_off_late", "near_gradients"})
 
 
 def from_dict(values: Any) -> Conf:
@@ -343,7 +345,7 @@ def _move_to_plugins(values: Any) -> None:
     if not isinstance(components, dict):
         return  # `_missing` refuses it
     moved = {}
-    for name, (key, off) in _NOW_PLUGINS.items():
+    for name, (key, off) in _FORMER_GROUPS.items():
         if isinstance(settings := components.get(name), dict):
             del components[name]
             if settings.get(key, off) != off:
