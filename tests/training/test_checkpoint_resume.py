@@ -56,7 +56,7 @@ CASES = {
     "count_matched": ["splat.densify.reset_every=50000"],
 }
 #: The others are marked slow.
-FAST = ("baseline", "xrgs", "mip", "curriculum", "count_matched")
+FAST = ("baseline", "xrgs", "mip", "count_matched")
 
 
 class Kill(BaseException):
