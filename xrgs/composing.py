@@ -353,11 +353,11 @@ def _move_to_plugins(values: Any) -> None:
     floaters = components.get("floaters")
     if isinstance(floaters, dict) and (share := floaters.pop("gradient_share", 0)):
         moved["near_gradients"] = {"share": share}
-    mip = components.get("mip")
-    until = mip.pop("until", NOMINAL_STEPS) if isinstance(mip, dict) else NOMINAL_STEPS
-    if until != NOMINAL_STEPS and mip.get("variance"):
-        moved["mip_off_late"] = mip | {"until": until}
-        mip["variance"] = 0.0
+    if isinstance(mip := components.get("mip"), dict):
+        until = mip.pop("until", NOMINAL_STEPS)
+        if until != NOMINAL_STEPS and mip.get("variance"):
+            moved["mip_off_late"] = mip | {"until": until}
+            mip["variance"] = 0.0
     if moved and isinstance(plugins := components.setdefault("plugins", {}), dict):
         plugins.update(moved)
 

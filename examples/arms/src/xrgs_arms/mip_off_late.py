@@ -49,7 +49,9 @@ class MipOffLate(Mip):
         """Whether the filter is part of the Gaussians."""
 
     @classmethod
-    def from_settings(cls, settings: Settings, setup: TrainingSetup) -> Self | None:
+    def from_settings(  # type: ignore[override]  # settings of its own
+        cls, settings: Settings, setup: TrainingSetup
+    ) -> Self | None:
         """Build the component; a `variance` of 0 leaves it off.
 
         Raises:
