@@ -362,7 +362,7 @@ def test_a_file_from_before_a_key_was_added_takes_the_baselines_value(
 ) -> None:
     values = asdict(baseline)
     del (
-        values["components"]["skip_backward"],
+        values["components"]["resolution_schedule"],
         values["splat"]["raster"]["absgrad"],
         values["limits"],
         values["lpips"],
@@ -372,14 +372,35 @@ def test_a_file_from_before_a_key_was_added_takes_the_baselines_value(
     assert conf == baseline
     assert added == {
         "splat.raster.absgrad": False,
-        "components.skip_backward.share": 1.0,
-        "components.skip_backward.tolerance": 0.0,
-        "components.skip_backward.decay": 0.95,
-        "components.skip_backward.begin": 15_000,  # in the file, splat.densify.stop
+        "components.resolution_schedule.start_share": 1.0,
+        "components.resolution_schedule.until": 15_000,  # in the file, splat.densify.stop
         "limits.minutes": 0.0,
         "limits.memory_gb": 0.0,
         "lpips.fetch": False,  # by the variable of the environment that the tests set
     }
+
+
+def test_a_file_from_before_components_were_moved_out_has_their_plugins(
+    baseline: Conf, tmp_path: Path
+) -> None:
+    """Those that were on; what was off leaves nothing."""
+    skipping = {"share": 0.5, "tolerance": 0.0, "decay": 0.95, "begin": 15_000}
+    for on in (True, False):
+        values = asdict(baseline)
+        values["components"]["skip_backward"] = skipping | ({} if on else {"share": 1.0})
+        values["components"]["error_score"] = {"of": "nothing", "views": 10}
+        values["components"]["floaters"]["gradient_share"] = 0.5 if on else 0.0
+        values["components"]["mip"] |= {"variance": 0.2 * on, "until": 20_000}
+        (file := tmp_path / "config.json").write_text(json.dumps(values))
+        conf, added = from_file(file)
+        moved = {
+            "skip_backward": skipping,
+            "near_gradients": {"share": 0.5},
+            "mip_off_late": {"variance": 0.2, "every": 100, "until": 20_000},
+        }
+        assert conf.components.plugins == (moved if on else {})
+        conf.components.plugins = {}
+        assert (conf, added) == (baseline, {})
 
 
 @pytest.mark.slow
@@ -445,7 +466,7 @@ class NewComponentsConf(ComponentsConf):
 def test_what_is_added_and_off_changes_no_identity(
     baseline: Conf, variance: float, every: int, late_from: int
 ) -> None:
-    old = replace(baseline.components, mip=MipConf(variance=variance, every=every, until=30_000))
+    old = replace(baseline.components, mip=MipConf(variance=variance, every=every))
     new = NewComponentsConf(
         **vars(old) | {"mip": NewMipConf(**vars(old.mip), added=3)},
         added=SupersampledConf(factor=1, late_factor=1, late_from=late_from),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
@@ -210,6 +211,36 @@ def test_a_change_of_a_plugin_is_another_cell(
     identity.training_code.cache_clear()
     assert cell_id(cell_identity(baseline, "v")) != cell_id(before)
     assert changed_code(before) == ([] if changed == "settings" else ["plugins/one"])
+
+
+@pytest.mark.parametrize(
+    ("line", "counts"),
+    [
+        ("from xrgs.training.components.exposure import Exposure", {"exposure", "adam"}),
+        ("from xrgs.training.components import exposure", {"exposure", "adam"}),
+        ("import xrgs.training.components.mip as filtered", {"mip"}),
+        ("from xrgs.training.components import Component", set()),
+        ("from xrgs.training.components.base import Component", set()),
+    ],
+)
+def test_the_built_in_components_that_a_plugin_extends_are_part_of_its_code(
+    line: str,
+    counts: set[str],
+    install: Install,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    install("dist", {"one": "one:Plugin"}, {"one.py": f"{line}\n{SOURCE}"})
+    copy = shutil.copytree(Path(components.__file__).parent, tmp_path / "training/components")
+    monkeypatch.setattr(plugins, "__file__", str(copy.parent / "plugins.py"))
+    before, changed = plugins.code_digest("one"), set()
+    for file in copy.glob("*.py"):
+        text = file.read_text()
+        file.write_text(f"{text}\nEDITED = 1\n")
+        if plugins.code_digest("one") != before:
+            changed.add(file.stem)
+        file.write_text(text)
+    assert changed == counts
 
 
 @pytest.mark.parametrize("settings", [None, 0.1, "weight", [1]])

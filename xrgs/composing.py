@@ -229,6 +229,18 @@ def _check_strategy(conf: Conf) -> None:
             )
 
 
+#: Former groups of `components` that are plugins of the same name now: the key that switched each
+#: on, and its value where it was off.
+_FORMER_GROUPS = {
+    "error_score": ("of", "nothing"),
+    "multiview_score": ("views", 0),
+    "noise_weighting": ("floor", 1.0),
+    "skip_backward": ("share", 1.0),
+}
+#: The ablations that were part of xrgs and are in the package `examples/arms` now.
+ARMS = frozenset({*_FORMER_GROUPS, "mip_off_late", "near_gradients"})
+
+
 def from_dict(values: Any) -> Conf:
     """Convert what `dataclasses.asdict` made of a config back to the config.
 
@@ -301,7 +313,8 @@ def from_file(file: Path) -> tuple[Conf, dict[str, Any]]:
     """Read the config that a cell's folder holds as JSON.
 
     A file from before a key was added lacks it. The key's value in `conf/config.yaml` is taken,
-    with which all that was added is off.
+    with which all that was added is off. A file from when a component of `examples/arms` was part
+    of xrgs has its settings elsewhere; they become those of the plugin where it was on.
 
     Args:
         file: The JSON file.
@@ -316,6 +329,7 @@ def from_file(file: Path) -> tuple[Conf, dict[str, Any]]:
     values = read_struct(file, Any)
     added = {}
     try:
+        _move_to_plugins(values)
         for group, name, key in _missing(values, Conf):
             value = reduce(getitem, key.split("."), _baseline())
             if value != _OPEN:
@@ -323,6 +337,29 @@ def from_file(file: Path) -> tuple[Conf, dict[str, Any]]:
         return from_dict(values), added
     except XrgsError as error:
         raise XrgsError(f"{file}: {error} (another version of xrgs may have written it)") from error
+
+
+def _move_to_plugins(values: Any) -> None:
+    """Move the settings of components that have become plugins, in place; what is off goes."""
+    components = values.get("components") if isinstance(values, dict) else None
+    if not isinstance(components, dict):
+        return  # `_missing` refuses it
+    moved = {}
+    for name, (key, off) in _FORMER_GROUPS.items():
+        if isinstance(settings := components.get(name), dict):
+            del components[name]
+            if settings.get(key, off) != off:
+                moved[name] = settings
+    floaters = components.get("floaters")
+    if isinstance(floaters, dict) and (share := floaters.pop("gradient_share", 0)):
+        moved["near_gradients"] = {"share": share}
+    if isinstance(mip := components.get("mip"), dict):
+        until = mip.pop("until", NOMINAL_STEPS)
+        if until != NOMINAL_STEPS and mip.get("variance"):
+            moved["mip_off_late"] = mip | {"until": until}
+            mip["variance"] = 0.0
+    if moved and isinstance(plugins := components.setdefault("plugins", {}), dict):
+        plugins.update(moved)
 
 
 @cache

@@ -190,16 +190,6 @@ class ResolutionScheduleConf:
 
 
 @dataclass(kw_only=True)
-class SkipBackwardConf:
-    """Steps without a backward pass after densification (SkipGS); not in the paper."""
-
-    share: float = off(1.0)
-    tolerance: float
-    decay: float
-    begin: int
-
-
-@dataclass(kw_only=True)
 class ConsistencyConf:
     """Cross-resolution consistency loss (paper, section 5.6)."""
 
@@ -238,37 +228,11 @@ class ContinuousWeightingConf:
 
 
 @dataclass(kw_only=True)
-class NoiseWeightingConf:
-    """A weight of an LR view by its own residual; not in the paper."""
-
-    floor: float = off(1.0)
-    begin: int
-
-
-@dataclass(kw_only=True)
 class MipConf:
     """Mip-Splatting's 3D smoothing filter; not in the paper."""
 
     variance: float = off(0.0)
     every: int
-    until: int = off(30_000)
-
-
-@dataclass(kw_only=True)
-class MultiviewScoreConf:
-    """Growth only where several views have high errors (FastGS); not in the paper."""
-
-    views: int = off(0)
-    error: float
-    pixels: float
-
-
-@dataclass(kw_only=True)
-class ErrorScoreConf:
-    """What grows first where a budget leaves room for some (Improved-GS); not in the paper."""
-
-    of: str = off("nothing")
-    views: int
 
 
 @dataclass(kw_only=True)
@@ -292,10 +256,9 @@ class ExposureConf:
 
 @dataclass(kw_only=True)
 class FloatersConf:
-    """Guards against Gaussians in the empty space close to cameras."""
+    """A guard against Gaussians in the empty space close to cameras."""
 
     near_share: float = off(0.0)
-    gradient_share: float = off(0.0)
 
 
 @dataclass(kw_only=True)
@@ -326,16 +289,12 @@ class ComponentsConf:
     supersampled: SupersampledConf
     formation: FormationConf
     resolution_schedule: ResolutionScheduleConf
-    skip_backward: SkipBackwardConf
     consistency: ConsistencyConf
     adaptive_weighting: AdaptiveWeightingConf
     region_weighting: RegionWeightingConf
     hybrid_schedule: HybridScheduleConf
     continuous_weighting: ContinuousWeightingConf
-    noise_weighting: NoiseWeightingConf
     mip: MipConf
-    multiview_score: MultiviewScoreConf
-    error_score: ErrorScoreConf
     natural_selection: NaturalSelectionConf
     exposure: ExposureConf
     floaters: FloatersConf

@@ -12,6 +12,7 @@ This module does not import torch, so that planning and reporting can use it.
 
 from __future__ import annotations
 
+import ast
 import dataclasses
 from importlib.machinery import PathFinder
 from importlib.metadata import EntryPoint, entry_points
@@ -24,13 +25,16 @@ from xrgs.safeio.code import digest_files
 from xrgs.safeio.hashing import digest
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
     from importlib.machinery import ModuleSpec
 
 GROUP = "xrgs.components"
 """The entry point group in which packages offer components."""
 
 _BYTECODE = frozenset({".pyc", ".pyo"})
+_COMPONENTS = "xrgs.training.components."
+#: Modules of that package which the core of an identity has.
+_SHARED = frozenset({"__init__", "base", "combined"})
 _Settings = TypeVar("_Settings")
 
 
@@ -70,7 +74,8 @@ def code_digest(name: str) -> str:
     """Return a digest of a plugin's source, without importing its package.
 
     It covers the entry point's value and every file of the package that the entry point names (or
-    of the module, where that is a single file) but bytecode and hidden files. What the package
+    of the module, where that is a single file) but bytecode and hidden files. It covers the modules
+    of built-in components that these files import, which a plugin may extend. What the package
     imports from other packages is not covered.
 
     Args:
@@ -90,6 +95,7 @@ def code_digest(name: str) -> str:
     base = origin.parent.parent if is_package else origin.parent
     files = _package_files(origin.parent) if is_package else [origin]
     found = {file.relative_to(base).as_posix(): file for file in files}
+    found |= _built_in(file for file in found.values() if file.suffix == ".py")
     return digest([point.value, digest_files(found)])
 
 
@@ -186,3 +192,27 @@ def _package_files(folder: Path) -> Iterator[Path]:
         hidden = any(part.startswith(".") for part in parts)
         if file.is_file() and not hidden and file.suffix not in _BYTECODE:
             yield file
+
+
+def _built_in(files: Iterable[Path]) -> dict[str, Path]:
+    """The modules of built-in components that Python files import, and that these import."""
+    found: dict[str, Path] = {}
+    waiting = [*files]
+    while waiting:
+        for name in _imported_components(waiting.pop()):
+            file = Path(__file__).parent / "components" / f"{name}.py"
+            if name not in _SHARED and _COMPONENTS + name not in found and file.is_file():
+                found[_COMPONENTS + name] = file
+                waiting.append(file)
+    return found
+
+
+def _imported_components(file: Path) -> Iterator[str]:
+    """What a Python file imports from `xrgs.training.components`: names of modules and others."""
+    for node in ast.walk(ast.parse(file.read_bytes())):
+        if not isinstance(node, (ast.Import, ast.ImportFrom)):
+            continue
+        package = f"{node.module}." if isinstance(node, ast.ImportFrom) else ""
+        for name in (package + alias.name for alias in node.names):
+            if name.startswith(_COMPONENTS):
+                yield name.removeprefix(_COMPONENTS).partition(".")[0]

@@ -15,6 +15,7 @@ from omegaconf.errors import ConfigKeyError
 from xrgs import config
 from xrgs.cli.overrides import explained, with_options_first, with_quotes
 from xrgs.cli.sweep import texts
+from xrgs.composing import ARMS
 from xrgs.errors import XrgsError
 from xrgs.photos.scenes import motorcycle
 from xrgs.sweep.axes import expand
@@ -197,9 +198,18 @@ def test_an_axis_of_the_sweepers_own_settings_is_planned(sweep_here: RunCommand)
 
 
 def test_a_glob_is_every_file_of_its_group_of_that_name(sweep_here: RunCommand) -> None:
-    _, _, err = sweep_here("scene=motorcycle", "+ablation=glob(mip*)", "dry_run=true")
-    assert "plan: 3 cells" in err
-    assert "/ mip_off_late /" in err
+    _, _, err = sweep_here("scene=motorcycle", "+ablation=glob(near*)", "dry_run=true")
+    assert "plan: 2 cells" in err
+    assert "/ near_limit /" in err
+
+
+@pytest.mark.parametrize("name", sorted(ARMS))
+def test_an_arm_that_was_moved_out_is_named_with_its_package(
+    name: str, sweep_here: RunCommand
+) -> None:
+    code, _, err = sweep_here("scene=motorcycle", f"+ablation=[keep_large,{name}]", "dry_run=true")
+    assert code == 1
+    assert f"ablation={name}: it is in a package of its own: pip install ./examples/arms" in err
 
 
 def test_the_home_folder_of_a_store_is_not_a_folder_called_tilde(

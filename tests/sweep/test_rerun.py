@@ -105,7 +105,7 @@ def test_a_cell_that_is_older_than_a_key_is_trained_with_the_baselines_value(
     assert line == (
         "config.json lacks newer keys; their values in the baseline are taken:"
         " train.validation=0.0, components.mip.variance=0.0, components.mip.every=100,"
-        " components.mip.until=30000, track=none"
+        " track=none"
     )
     assert CellFolder(result.folder.path).config().train.validation == 0
 

@@ -48,13 +48,10 @@ _DEFAULT = (
     "components.render_scale.gamma=0.25",
     "components.consistency.weight=0.1",
     "components.consistency.lr_mode=fold",
-    "components.noise_weighting.floor=0.25",
-    "components.noise_weighting.begin=12000",
     "components.mip.variance=0.2",
     "components.formation.widths=tag",
     "components.exposure.mode=affine",
     "components.floaters.near_share=0.95",
-    "components.floaters.gradient_share=0.8",
     "components.densify.decide=per_class",
     "components.densify.lr_prune=1.01",
 )

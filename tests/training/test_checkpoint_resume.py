@@ -41,16 +41,12 @@ CASES = {
     "budget": ["+ablation=budget", "splat.densify.budget=0.05"],
     # Its rates are found anew between refinements too, or they would be new at every restart.
     "mip": ["+ablation=mip", "components.mip.every=7"],
-    "mip_off_late": ["+ablation=mip_off_late", "components.mip.every=7"],
-    "noise_weighting": ["+ablation=noise_weighting", "components.noise_weighting.begin=8000"],
-    "skip_backward": ["+ablation=skip_backward", "components.skip_backward.begin=3000"],
     "resolution_schedule": ["+ablation=resolution_schedule"],
     "harmonics_every": ["+ablation=harmonics_every"],
-    "multiview_score": ["+ablation=multiview_score"],
     "formation": ["+ablation=formation"],
     "exposure": ["+ablation=exposure"],
     "mcmc": ["+ablation=mcmc", "splat.densify.budget=0.03"],
-    "floaters": ["+ablation=[near_limit,near_gradients]", "components.floaters.near_share=1"],
+    "floaters": ["+ablation=near_limit", "components.floaters.near_share=1"],
     "natural_selection": [
         "+ablation=natural_selection",
         "components.natural_selection.budget=0.003",
@@ -60,7 +56,7 @@ CASES = {
     "count_matched": ["splat.densify.reset_every=50000"],
 }
 #: The others are marked slow.
-FAST = ("baseline", "xrgs", "mip", "skip_backward", "count_matched")
+FAST = ("baseline", "xrgs", "mip", "count_matched")
 
 
 class Kill(BaseException):

@@ -346,9 +346,6 @@ ACTS_HERE = {
 @pytest.mark.parametrize("ablation", [name for name in ABLATIONS if name != "dense"])
 def test_each_ablation_changes_the_result(data: Dataset, ablation: str) -> None:
     overrides = ["train.steps=20", "splat.backend=auto"]
-    if ablation == "noise_weighting":  # it lowers no weight where all photographs fit alike
-        white = dataclasses.replace(data.train[1], pixels=torch.ones(12, 12, 3))
-        data = dataclasses.replace(data, train=(data.train[0], white, *data.train[2:]))
     plain = train_cell(data, compose(*overrides))
     conf = compose(*overrides, f"+ablation={ablation}", *ACTS_HERE.get(ablation, ()))
     if conf.matched_to is not None:  # as a sweep does
@@ -370,6 +367,57 @@ def test_each_ablation_trains_with_plus_exposure_and_masks(data: Dataset, ablati
     result = train(dataclasses.replace(data, train=tuple(masked)), conf)
     assert all(math.isfinite(row["loss"]) for row in result.history)
     assert len({row["exposure.gain"] for row in result.history}) > 1
+
+
+class Counter(components.Component):
+    """Answers that no backward pass is needed at some steps, and counts the calls of the hooks."""
+
+    def __init__(self, skipped: set[int]) -> None:
+        self.skipped = skipped
+        self.calls: dict[str, list[int]] = {"asked": [], "backward": [], "densify": []}
+
+    def needs_backward(self, loss: torch.Tensor, step: Step) -> bool:
+        assert loss.ndim == 0
+        self.calls["asked"].append(step.number)
+        return step.number not in self.skipped
+
+    def after_backward(self, gaussians: Gaussians, step: Step) -> None:
+        assert gaussians.means.grad is not None
+        self.calls["backward"].append(step.number)
+
+    def densification_grad2d(self, grad2d: torch.Tensor, step: Step) -> torch.Tensor:
+        self.calls["densify"].append(step.number)
+        return grad2d
+
+
+def test_a_skipped_step_has_no_update_and_every_component_is_asked(
+    data: Dataset, short: Conf
+) -> None:
+    first, second = Counter({3, 4}), Counter({4, 7})
+    result = train(data, short, extra_components=[first, second])
+    done = [step for step in range(short.train.steps) if step not in {3, 4, 7}]
+    assert first.calls["asked"] == second.calls["asked"] == list(range(short.train.steps))
+    assert first.calls["backward"] == first.calls["densify"] == done
+    totals = [row["skipped_backward"] for row in result.history[:9]]
+    assert totals == [0, 0, 0, 1, 2, 2, 2, 3, 3]
+
+
+def test_without_a_skipped_step_the_history_has_no_such_column(data: Dataset, short: Conf) -> None:
+    assert "skipped_backward" not in train(data, short).history[-1]
+
+
+def test_the_last_steps_can_be_left_out(data: Dataset, short: Conf) -> None:
+    """Training whose last 20 steps are all skipped ends with what it had after 20 steps."""
+    seen: list[Gaussians] = []
+
+    def look(gaussians: Gaussians) -> dict[str, float | None]:
+        seen.append(gaussians)
+        return {}
+
+    short.splat.densify.stop, short.train.evaluate_every = 0, 20
+    result = train(data, short, extra_components=[Counter(set(range(20, 40)))], evaluate=look)
+    assert same(result.gaussians, seen[0])
+    assert not same(train(data, short).gaussians, seen[0])
 
 
 @pytest.mark.parametrize(("ablation", "key"), NOT_WITH_PLUS.items())

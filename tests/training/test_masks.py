@@ -40,7 +40,6 @@ from xrgs.training.components import Step
 from xrgs.training.components.mip import sampling_rates
 from xrgs.training.components.resolution_schedule import ResolutionSchedule
 from xrgs.training.components.texture import gradient_magnitude, mean_gradient
-from xrgs.training.components.view_scores import _in_unit_range
 from xrgs.training.components.weighting import _box_mean, region_attenuations
 from xrgs.training.dataset import Dataset, LoadedView
 from xrgs.training.loop import train
@@ -104,8 +103,6 @@ COMPONENTS = (
     "components.region_weighting.texture=0.3",
     "components.consistency.weight=0.1",
     "components.mip.variance=0.2",
-    "components.multiview_score.views=2",
-    "components.error_score.of=edges",
     "components.supersampled.factor=2",
     "components.resolution_schedule.start_share=0.3",
     "splat.densify.budget=0.05",
@@ -263,13 +260,6 @@ def views() -> dict[str, LoadedView]:
     """A view of each tag by its tag; the LR view is 5 times smaller."""
     both = (make_view("HR", noise(60, 75).float()), make_view("LR", noise(12, 15, 1).float()))
     return {view.tag: view for view in both}
-
-
-def test_scores_are_scaled_by_the_used_pixels_and_0_outside() -> None:
-    values = torch.tensor([[1.0, 2.0, 9.0], [3.0, 5.0, -4.0]])
-    mask = torch.tensor([[True, True, False], [True, True, False]])
-    expected = torch.tensor([[0.0, 0.25, 0.0], [0.5, 1.0, 0.0]])
-    assert torch.equal(_in_unit_range(values, mask), expected)
 
 
 def test_a_masked_pixel_sets_no_sampling_rate() -> None:

@@ -143,6 +143,11 @@ def _missing_file(file: str, options: Sequence[str]) -> str:
     if group == "scene" and user_path(name).is_dir():
         word = shlex.quote(f"scene.path={name}")
         return f"scene={name}: a folder of photographs is given as scene=folder {word}"
+    if group == "ablation" and name in composing.ARMS:
+        return (
+            f"ablation={name}: it is in a package of its own: pip install ./examples/arms, and"
+            " xrgs-sweep --config-dir examples/arms/conf finds it"
+        )
     all_known = f"; choose from: {', '.join(known)}"
     if len(known) > _MAX_LISTED:
         all_known = f"; xrgs-sweep --help lists all {len(known)}"

@@ -31,13 +31,10 @@ from xrgs.training.components.floaters import Floaters
 from xrgs.training.components.gradient_scaling import GradientScaling
 from xrgs.training.components.mip import Mip
 from xrgs.training.components.natural_selection import NaturalSelection
-from xrgs.training.components.noise_weighting import NoiseWeighting
 from xrgs.training.components.regularization import Regularization
 from xrgs.training.components.render_scale import RenderScale
 from xrgs.training.components.resolution_schedule import ResolutionSchedule
-from xrgs.training.components.skip_backward import SkipBackward
 from xrgs.training.components.supersampled import Supersampled
-from xrgs.training.components.view_scores import ErrorScore, MultiviewScore
 from xrgs.training.components.weighting import Weighting
 
 Build = Callable[..., Components]
@@ -50,21 +47,16 @@ ON: dict[str, tuple[Any, type[Component]]] = {
     "curriculum.lr_only": (5000, Curriculum),
     "render_scale.gamma": (0.25, RenderScale),
     "consistency.weight": (0.1, Consistency),
-    "noise_weighting.floor": (0.25, NoiseWeighting),
     "mip.variance": (0.2, Mip),
     "supersampled.factor": (2, Supersampled),
     "supersampled.late_factor": (2, Supersampled),
     "formation.widths": ("tag", Supersampled),
     "resolution_schedule.start_share": (0.5, ResolutionSchedule),
-    "skip_backward.share": (0.5, SkipBackward),
-    "multiview_score.views": (2, MultiviewScore),
-    "error_score.of": ("edges", ErrorScore),
     "natural_selection.budget": (0.5, NaturalSelection),
     "exposure.mode": ("gain", Exposure),
     "regularization.opacity": (0.01, Regularization),
     "regularization.scale": (0.01, Regularization),
     "floaters.near_share": (0.5, Floaters),
-    "floaters.gradient_share": (0.5, Floaters),
     "continuous_weighting.gamma": (1.0, Weighting),
 }
 #: Keys that `off` declares too, with another value: they build no component by themselves. The
@@ -72,7 +64,6 @@ ON: dict[str, tuple[Any, type[Component]]] = {
 #: without one; the last is read by `xrgs.training.count_matching`.
 OTHERS: dict[str, Any] = {
     "loss_weighting.stat_from": "unweighted",
-    "mip.until": 20_000,
     "natural_selection.drop_every": 100,
     "count_matched.gaussians": 100,
 }
@@ -139,16 +130,6 @@ def test_components_that_decide_what_grows_are_refused_by_a_strategy_that_draws(
     Components([Component()]).check_strategy("mcmc", MCMCStrategy)
     with pytest.raises(XrgsError, match=r"^splat\.strategy=mcmc: .* Densify and Other would"):
         ranked.check_strategy("mcmc", MCMCStrategy)
-
-
-@pytest.mark.parametrize("key", ["multiview_score.views", "error_score.of"])
-def test_each_component_that_chooses_or_ranks_is_refused_by_name(
-    key: str, build: Build, off: ComponentsConf
-) -> None:
-    value, kind = ON[key]
-    put(off, key, value)
-    with pytest.raises(XrgsError, match=kind.__name__):
-        build(off).check_strategy("mcmc", MCMCStrategy)
 
 
 class Other(Component):
@@ -297,18 +278,8 @@ def test_what_is_imported(module: str, unused: set[str]) -> None:
         ("region_weighting.texture", float("nan")),
         ("hybrid_schedule.ramp", -1),
         ("continuous_weighting.gamma", -0.43),
-        ("noise_weighting.floor", -0.1),
-        ("noise_weighting.floor", 1.1),
-        ("noise_weighting.begin", -1),
         ("mip.variance", -0.2),
         ("mip.every", 0),
-        ("mip.until", 0),
-        ("multiview_score.views", -1),
-        ("multiview_score.error", -0.1),
-        ("multiview_score.error", 1.0),
-        ("multiview_score.pixels", float("nan")),
-        ("error_score.views", 0),
-        ("error_score.of", "all"),
         ("regularization.opacity", -0.01),
         ("regularization.scale", float("inf")),
         ("natural_selection.budget", -1.0),
@@ -316,12 +287,6 @@ def test_what_is_imported(module: str, unused: set[str]) -> None:
         ("natural_selection.until", 16_000),
         ("natural_selection.until", 30_001),
         ("floaters.near_share", -0.5),
-        ("floaters.gradient_share", float("inf")),
-        ("skip_backward.share", -0.1),
-        ("skip_backward.share", 1.1),
-        ("skip_backward.decay", 1.0),
-        ("skip_backward.decay", -1.0),
-        ("skip_backward.tolerance", -0.1),
         ("resolution_schedule.start_share", 0.0),
         ("resolution_schedule.start_share", 1.5),
         ("resolution_schedule.until", 0),

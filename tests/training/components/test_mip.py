@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from tests.conftest import composed as compose
-from tests.training.conftest import same
 from xrgs.config import ComponentsConf, MipConf
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import ActivatedGaussians, Gaussians, from_points
@@ -67,9 +66,9 @@ def splats(*means: tuple[float, float, float]) -> Gaussians:
     return made
 
 
-def on(*cameras: Camera, every: int = 100, until: int = 30_000) -> Mip:
+def on(*cameras: Camera, every: int = 100) -> Mip:
     views = [view("LR" if c is CLOSE else "HR", c) for c in cameras]
-    return Mip(MipConf(variance=0.2, every=every, until=until), views, NEAR)
+    return Mip(MipConf(variance=0.2, every=every), views, NEAR)
 
 
 @pytest.mark.parametrize("order", [(FAR, CLOSE), (CLOSE, FAR)])
@@ -249,51 +248,6 @@ def test_a_reset_caps_what_is_rendered() -> None:
     torch.testing.assert_close(rendered[[0, 2]], torch.full((2,), 0.01))
     assert gaussians.opacities[1] == -6.0  # it was below the cap before
     assert (gaussians.opacities.detach().sigmoid()[[0, 2]] > 0.01).all()
-
-
-def test_before_its_end_the_filter_becomes_part_of_the_gaussians() -> None:
-    gaussians = splats((0.0, 0.0, 0.0), (0.1, 0.05, 0.5), (50.0, 0.0, 0.0))
-    mip = on(FAR, CLOSE, until=20_000)
-    mip.on_gaussians_changed(gaussians)
-    before, last = (Step(number, 300, STEP.view) for number in (198, 199))
-    filtered = mip.before_render(gaussians.activated(), last)
-    parameters = gaussians.scales, gaussians.opacities
-    mip.after_step(gaussians, before)
-    assert not torch.equal(gaussians.activated().scales, filtered.scales)
-    mip.after_step(gaussians, last)
-    assert gaussians.scales is parameters[0]  # the optimizer's own tensors
-    assert gaussians.opacities is parameters[1]
-    activated = gaussians.activated()
-    torch.testing.assert_close(activated.scales, filtered.scales, rtol=1e-6, atol=0)
-    torch.testing.assert_close(activated.opacities, filtered.opacities, rtol=1e-6, atol=0)
-    # From there on nothing filters them a second time.
-    first = Step(200, 300, STEP.view)
-    assert mip.before_render(activated, first) is activated
-    assert first.log == {}
-    assert mip.opacity_attenuation(gaussians) is None
-    values = [parameter.detach().clone() for parameter in parameters]
-    mip.on_gaussians_changed(gaussians)
-    mip.after_step(gaussians, first)
-    mip.bake(gaussians)
-    assert all(torch.equal(*pair) for pair in zip(values, parameters, strict=True))
-
-
-def test_the_model_at_the_end_of_the_filter_is_the_one_with_it(data: Dataset) -> None:
-    """To the bit: what is evaluated then is what a training that keeps the filter evaluates."""
-    found = []
-    for until in (15_000, 30_000):
-        conf = compose(*SHORT, f"components.mip.until={until}", "train.evaluate_every=10")
-        seen: list[Gaussians] = []
-
-        def look(gaussians: Gaussians, seen: list[Gaussians] = seen) -> dict[str, float | None]:
-            seen.append(gaussians)
-            return {}
-
-        result = train(data, conf, evaluate=look)
-        found.append((*seen, result.gaussians))
-    (halfway, ended), (kept_halfway, kept) = found
-    assert same(halfway, kept_halfway)
-    assert not same(ended, kept)
 
 
 @pytest.mark.parametrize("name", ["supersampled", "formation", "resolution_schedule"])

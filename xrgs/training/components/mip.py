@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from itertools import zip_longest
 from typing import TYPE_CHECKING, Any, Self
 
@@ -59,10 +58,6 @@ class Mip(Component):
     render other sizes, which changes nothing in what a photograph resolves, and nothing in the
     filter.
 
-    Ours: training goes on without the filter from step `until` on. Just before that step the filter
-    becomes part of the trained scales and opacities, and the render stays the same. If the filter
-    were dropped, every Gaussian would become smaller and more opaque at that step.
-
     Attributes:
         variance: [N] variance of each Gaussian's filter, s / nu_k^2, in world units squared.
         unseen_count: The number of Gaussians that no view sees.
@@ -76,14 +71,12 @@ class Mip(Component):
             views: All training views.
             near: Depth below which a Gaussian is not rendered, world units.
         """
-        self.strength, self.every, self.until = settings.variance, settings.every, settings.until
+        self.strength, self.every = settings.variance, settings.every
         self.cameras = [view.camera for view in views]
         self.masks = [view.mask for view in views]
         self.near = near
         self.variance = torch.empty(0)
         self.unseen_count = 0
-        self.baked = False
-        """Whether the filter is part of the Gaussians."""
 
     @classmethod
     def from_settings(cls, settings: MipConf, setup: TrainingSetup) -> Self | None:
@@ -93,17 +86,14 @@ class Mip(Component):
             XrgsError: A setting is out of its range.
         """
         check_not_negative("components.mip.variance", settings.variance)
-        for name in ("every", "until"):
-            if (value := getattr(settings, name)) < 1:
-                raise XrgsError(f"components.mip.{name}={value}: must be at least 1")
+        if settings.every < 1:
+            raise XrgsError(f"components.mip.every={settings.every}: must be at least 1")
         if settings.variance == 0:
             return None
         return cls(settings, setup.data.train, setup.splat.raster.near)
 
     def opacity_attenuation(self, gaussians: Gaussians) -> Tensor | None:
-        """Return the factors [N] by which the filter lowers the opacities; None without it."""
-        if self.baked:
-            return None
+        """Return the factors [N] by which the filter lowers the opacities."""
         self._update_variance(gaussians.means)
         # In double, since the last digits in float32 depend on the processor.
         scales = gaussians.scales.detach().double().exp()
@@ -112,8 +102,7 @@ class Mip(Component):
 
     def on_gaussians_changed(self, gaussians: Gaussians) -> None:
         """Compute the filter of the Gaussians as they are now."""
-        if not self.baked:
-            self._update_variance(gaussians.means)
+        self._update_variance(gaussians.means)
 
     def before_render(self, activated: ActivatedGaussians, step: Step) -> ActivatedGaussians:
         """Apply the filter to scales and opacities; gradients do not reach the filter itself.
@@ -121,8 +110,6 @@ class Mip(Component):
         `mip.sigma` records the mean standard deviation, in world units, and `mip.unseen` the number
         of Gaussians that no view sees.
         """
-        if self.baked:
-            return activated
         if step.number % self.every == 0:
             self._update_variance(activated.means)
             step.log["mip.sigma"] = rounded_mean(rounded_sqrt(self.variance))
@@ -130,18 +117,9 @@ class Mip(Component):
         scales, opacities = smooth(activated.scales, activated.opacities, self.variance)
         return activated._replace(scales=scales, opacities=opacities)
 
-    def after_step(self, gaussians: Gaussians, step: Step) -> None:
-        """Make the filter part of the Gaussians before step `until`."""
-        if not self.baked and replace(step, number=step.number + 1).nominal >= self.until:
-            # Adam's moments stay as they are; our choice.
-            self.bake(gaussians)
-            self.baked = True
-
     @torch.no_grad()
     def bake(self, gaussians: Gaussians) -> None:
-        """Apply the filter to the scales and opacities, unless they have it already."""
-        if self.baked:
-            return
+        """Apply the filter to the scales and opacities."""
         # In double, since the last digits in float32 depend on the processor.
         scales, opacities = smooth(
             gaussians.scales.double().exp(),
@@ -156,13 +134,12 @@ class Mip(Component):
         gaussians.opacities.copy_(logits)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the filter, of the means at the step when it was computed, and where it is."""
-        return {"variance": self.variance, "baked": self.baked}
+        """Return the filter, of the means at the step when it was computed."""
+        return {"variance": self.variance}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore what `state_dict` returned."""
         self.variance = state["variance"].to(self.variance.device)
-        self.baked = bool(state["baked"])
 
     def _update_variance(self, means: Tensor) -> None:
         rates = sampling_rates(means.detach(), self.cameras, self.near, self.masks)

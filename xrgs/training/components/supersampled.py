@@ -89,7 +89,7 @@ class Supersampled(Component):
         self.zoom = zoom if degradation == "digital_zoom" else 1
         low = [view for view in views if view.tag == "LR"]
         self.blur = BlurWidths(blur, low) if blur.widths != "none" else None
-        self.needs = [view.need for view in views]
+        self.needs = [view.supersampling for view in views]
 
     @classmethod
     def from_settings(cls, settings: SupersampledConf, setup: TrainingSetup) -> Self | None:

@@ -11,18 +11,20 @@ import torch
 from scipy.ndimage import correlate
 from torch import Tensor
 
-from tests.conftest import composed as compose
+from examples.arms.tests.conftest import with_arms
 from tests.splat.scenes import noise
 from tests.training.components.conftest import renderer_of
 from xrgs.config import ComponentsConf
+from xrgs.errors import XrgsError
 from xrgs.splat.attribution import attribute_pixels
 from xrgs.splat.gaussians import ActivatedGaussians, Gaussians
 from xrgs.splat.rendering import rasterize_parameters
 from xrgs.splat.settings import RasterSettings
-from xrgs.training.components import Component, Components, Step
-from xrgs.training.components.view_scores import ErrorScore, edges
+from xrgs.splat.strategy.mcmc import MCMCStrategy
+from xrgs.training.components import Components, Step
 from xrgs.training.dataset import Dataset, LoadedView
 from xrgs.training.loop import train
+from xrgs_arms.view_scores import ErrorScore, edges
 
 Build = Callable[..., Components]
 Scores = Callable[..., Tensor]
@@ -51,14 +53,14 @@ def image_of(gaussians: ActivatedGaussians, view: LoadedView) -> Tensor:
 def test_a_gaussian_may_grow_where_it_shows_enough_high_errors(
     build: Build, off: ComponentsConf, hr: Step, shown: Gaussians, fine: list[LoadedView]
 ) -> None:
-    off.multiview_score.views, off.multiview_score.error = 2, 0.7
+    off.plugins["multiview_score"] = settings = {"views": 2, "error": 0.7}
     expected = torch.zeros(8, dtype=torch.float64)
     for view, area in zip(fine, (1, 25), strict=True):
         error = (image_of(shown.activated(), view) - view.image).abs().mean(dim=-1)
         high = (error - error.min()) / (error.max() - error.min()) > 0.7
         assert 5 < high.sum() < high.numel() / 2
         expected += area * attributed(high.double(), shown, view) / 2
-    off.multiview_score.pixels = expected.median().item() * (1 + 1e-9)
+    settings["pixels"] = expected.median().item() * (1 + 1e-9)
     grows = ready(build(off, *fine)).may_grow(shown, hr)
     assert grows is not None
     assert torch.equal(grows, expected > expected.median())
@@ -80,7 +82,7 @@ def test_edges_are_scipys_laplacian() -> None:
 def test_what_grows_is_ranked_by_edges_or_errors(
     build: Build, off: ComponentsConf, hr: Step, shown: Gaussians, fine: list[LoadedView], of: str
 ) -> None:
-    off.error_score.of, off.error_score.views = of, 5
+    off.plugins["error_score"] = {"of": of, "views": 5}
     expected = torch.zeros(8, dtype=torch.float64)
     for view in fine:
         pixels = (image_of(shown.activated(), view) - view.image).abs().mean(dim=-1)
@@ -95,44 +97,11 @@ def test_what_grows_is_ranked_by_edges_or_errors(
     assert scores.std() > 0.1
 
 
-class Lowered(Component):
-    """Lowers all opacities, so that a component that renders without it has other scores."""
-
-    def before_render(self, activated: ActivatedGaussians, step: Step) -> ActivatedGaussians:
-        return activated._replace(opacities=activated.opacities * 0.1)
-
-
-def test_views_are_rendered_with_all_components(
-    build: Build, off: ComponentsConf, lr: Step, shown: Gaussians, fine: list[LoadedView]
-) -> None:
-    off.supersampled.factor = off.supersampled.late_factor = 2
-    parts = Components([*build(off, *fine), Lowered()])
-    renderer = renderer_of(parts)
-    lower = shown.activated()._replace(opacities=shown.activated().opacities * 0.1)
-    camera = parts.render_camera(lr.view.camera, lr)
-    assert camera.width == 2 * lr.view.camera.width
-    render = rasterize_parameters(*lower, camera, RasterSettings(), sh_degree=0)
-    down = parts.to_photograph(render.image, lr)
-    torch.testing.assert_close(renderer.photograph(shown, lr), down)
-    # A Gaussian's weights are what its colour alone makes of the photograph.
-    pixels = torch.rand(down.shape[:2], generator=torch.Generator().manual_seed(1)).double()
-    sums = renderer.attribute(pixels, shown, lr)
-    for index in range(len(shown)):
-        sh0 = torch.full((8, 1, 3), -9.0).double()
-        sh0[index] = 0.5 * np.sqrt(4 * np.pi)  # a colour of 1
-        only = rasterize_parameters(
-            *lower._replace(sh0=sh0), camera, RasterSettings(), sh_degree=0
-        ).image
-        expected = (parts.to_photograph(only, lr)[..., 0] * pixels).sum()
-        torch.testing.assert_close(sums[index], expected)
-    assert renderer.recorder.evaluations == 2 * render.evaluations
-
-
 def test_the_work_counts_as_the_runs(data: Dataset) -> None:
     every_third_step = ("train.steps=20", "splat.backend=auto", "splat.densify.every=5000")
     over = (*every_third_step, "splat.densify.grow_grad2d=1")  # nothing grows
-    plain = train(data, compose(*over))
-    scored = train(data, compose(*over, "+ablation=multiview_score"))
+    plain = train(data, with_arms(*over))
+    scored = train(data, with_arms(*over, "+ablation=multiview_score"))
     assert len(scored.gaussians) == len(plain.gaussians)
     # Refinements at steps 3, 6 and 9 render each of the four views twice.
     assert 1.5 * plain.evaluations < scored.evaluations < 3 * plain.evaluations
@@ -141,7 +110,7 @@ def test_the_work_counts_as_the_runs(data: Dataset) -> None:
 def test_views_follow_from_the_seed_and_the_step(
     build: Build, off: ComponentsConf, hr: Step, shown: Gaussians, fine: list[LoadedView]
 ) -> None:
-    off.error_score.of, off.error_score.views = "edges", 1
+    off.plugins["error_score"] = {"of": "edges", "views": 1}
     many = [replace(fine[i % 2], name=f"v{i}") for i in range(6)]
     for index, view in enumerate(many):
         view.image[0, 0] = index / 6
@@ -152,3 +121,45 @@ def test_views_follow_from_the_seed_and_the_step(
     )
     assert torch.equal(first, again)
     assert not (torch.equal(first, second) and torch.equal(first, third))
+
+
+@pytest.mark.parametrize(
+    ("name", "setting"),
+    [
+        ("multiview_score", {"views": -1}),
+        ("multiview_score", {"error": -0.1}),
+        ("multiview_score", {"error": 1.0}),
+        ("multiview_score", {"pixels": float("nan")}),
+        ("error_score", {"views": 0}),
+        ("error_score", {"of": "all"}),
+    ],
+)
+def test_a_value_out_of_range_names_its_key(
+    name: str, setting: dict[str, object], build: Build, off: ComponentsConf
+) -> None:
+    off.plugins[name] = ({"views": 2} if name == "multiview_score" else {"of": "edges"}) | setting
+    ((key, value),) = setting.items()
+    with pytest.raises(XrgsError, match=rf"^components\.plugins\.{name}\.{key}={value}"):
+        build(off)
+
+
+@pytest.mark.parametrize(
+    ("name", "settings"), [("multiview_score", {"views": 2}), ("error_score", {"of": "edges"})]
+)
+def test_a_strategy_that_draws_what_grows_refuses_them(
+    name: str, settings: dict[str, object], build: Build, off: ComponentsConf
+) -> None:
+    off.plugins[name] = settings
+    (component,) = parts = build(off)
+    with pytest.raises(XrgsError, match=type(component).__name__):
+        parts.check_strategy("mcmc", MCMCStrategy)
+
+
+@pytest.mark.parametrize(
+    ("name", "settings"), [("multiview_score", {"views": 0}), ("error_score", {})]
+)
+def test_they_are_off(
+    name: str, settings: dict[str, object], build: Build, off: ComponentsConf
+) -> None:
+    off.plugins[name] = settings
+    assert build(off) == ()

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self
 
 import torch
@@ -13,7 +13,7 @@ from torch import Tensor
 from xrgs.errors import XrgsError
 from xrgs.splat.resample import resize
 from xrgs.splat.rounding import rounded_mean
-from xrgs.training.components.base import (
+from xrgs.training.components import (
     Component,
     Step,
     TrainingSetup,
@@ -22,13 +22,22 @@ from xrgs.training.components.base import (
 )
 
 if TYPE_CHECKING:
-    from xrgs.config import NoiseWeightingConf
     from xrgs.splat.gaussians import Gaussians
 
-_log = logging.getLogger(__name__)
 
 _LEAST_RATE = 0.1
 """The running means are over about the last ten steps on a view; our choice."""
+
+
+@dataclass
+class Settings:
+    """The keys under `components.plugins.noise_weighting` of the config."""
+
+    floor: float = 1.0
+    """The lowest weight of an LR view; 1 is off."""
+    begin: int = 15_000
+    """The step of a 30,000-step run from which on the weights apply: densification's end; our
+    choice."""
 
 
 class NoiseWeighting(Component):
@@ -62,6 +71,9 @@ class NoiseWeighting(Component):
     few. So this is a guard against single photographs that fit nothing else, and not a measure of
     noise.
 
+    The hooks of plugins run after those of xrgs's own components, so that the weight multiplies the
+    penalties of `regularization`, `exposure` and `formation` as well.
+
     Adam [kingma2015] divides a gradient by its recent size, so that a weight acts only where LR and
     HR views reach the same Gaussian.
 
@@ -69,13 +81,15 @@ class NoiseWeighting(Component):
     and `noise_weighting.LR` the weight of an LR view.
     """
 
+    settings_type = Settings
+
     def __init__(
-        self, settings: NoiseWeightingConf, views: Sequence[TrainingView], backend: str = "torch"
+        self, settings: Settings, views: Sequence[TrainingView], backend: str = "torch"
     ) -> None:
         """Take the sizes at which residuals are compared.
 
         Args:
-            settings: `components.noise_weighting` of the config.
+            settings: `components.plugins.noise_weighting` of the config.
             views: All training views.
             backend: `torch` or `native`: the implementation of the resampling.
 
@@ -85,8 +99,8 @@ class NoiseWeighting(Component):
         self.hr_names = [view.name for view in views if view.tag == "HR"]
         if not self.hr_names:
             raise XrgsError(
-                f"components.noise_weighting.floor={settings.floor}: there is no HR view to compare"
-                " the residuals of LR views with; set it to 1, or train on the mixed views"
+                f"components.plugins.noise_weighting.floor={settings.floor}: there is no HR view to"
+                " compare the residuals of LR views with; set it to 1, or train on the mixed views"
                 " (train.views=mixed)"
             )
         self.settings = settings
@@ -106,13 +120,13 @@ class NoiseWeighting(Component):
         """The number of steps on each of these views."""
 
     @classmethod
-    def from_settings(cls, settings: NoiseWeightingConf, setup: TrainingSetup) -> Self | None:
+    def from_settings(cls, settings: Settings, setup: TrainingSetup) -> Self | None:
         """Build the component; a `floor` of 1 leaves it off.
 
         Raises:
             XrgsError: A setting is out of its range, or there is no HR view.
         """
-        key = "components.noise_weighting"
+        key = "components.plugins.noise_weighting"
         if not 0 <= settings.floor <= 1:
             raise XrgsError(f"{key}.floor={settings.floor}: must be from 0 to 1")
         check_not_negative(f"{key}.begin", settings.begin)
@@ -139,17 +153,16 @@ class NoiseWeighting(Component):
         ratio = math.fsum(measured) / len(measured) / residual
         return min(1.0, max(self.settings.floor, ratio))
 
-    def after_training(self, gaussians: Gaussians) -> None:
-        """Log the lowest and the highest weight with the names of the photographs."""
-        del gaussians
+    def findings(self) -> list[str]:
+        """Return the lowest and the highest weight with the names of the photographs."""
         weights = {n: self.weight(n) for n in self.residuals if n not in self.hr_names}
         if not weights:
-            return
+            return []
         low, high = min(weights, key=lambda n: weights[n]), max(weights, key=lambda n: weights[n])
-        _log.info(
-            "noise_weighting: the weights of the LR photographs are %.3f (%s) to %.3f (%s)",
-            *(weights[low], low, weights[high], high),
-        )
+        return [
+            f"noise_weighting: the weights of the LR photographs are {weights[low]:.3f} ({low}) to"
+            f" {weights[high]:.3f} ({high})"
+        ]
 
     def state_dict(self) -> dict[str, Any]:
         """Return the running means and the numbers of steps, by view."""

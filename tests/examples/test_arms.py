@@ -1,4 +1,4 @@
-"""`examples/new_component`: installed beside xrgs, swept, edited, and trained again."""
+"""`examples/arms`: installed beside xrgs, swept, edited, and trained again."""
 
 from __future__ import annotations
 
@@ -15,9 +15,11 @@ from pathlib import Path
 
 import pytest
 
-EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "new_component"
-SOURCE = "xrgs_opacity_regularizer/__init__.py"
-NAME = "opacity_regularizer"
+EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "arms"
+SOURCE = "xrgs_arms/skip_backward.py"
+NAME = "skip_backward"
+#: The settings of the ablation of this name, on the command line.
+SETTINGS = (f"+components.plugins.{NAME}.share=0.5", f"+components.plugins.{NAME}.begin=15000")
 CELL = ("scene=motorcycle", "preset=smoke", "train.steps=4", "threads=1", "store=s")
 
 pytestmark = pytest.mark.slow
@@ -40,7 +42,7 @@ class Installed:
         return self.run_command("sweep", self.folder, *arguments, **environment)
 
     def cell(self) -> Path:
-        """The folder of the one cell with the regulariser."""
+        """The folder of the one cell with the arm."""
         (folder,) = (
             file.parent
             for file in (self.folder / "s" / "cells").glob("*/identity.json")
@@ -55,7 +57,7 @@ def example(
 ) -> Installed:
     folder = tmp_path_factory.mktemp("example")
     # From a copy: pip may leave files in the folder that it builds.
-    source = shutil.copytree(EXAMPLE, folder / "new_component")
+    source = shutil.copytree(EXAMPLE, folder / "arms")
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "install", "--no-deps"]
     # Without build isolation, which would download the build backend: it is a test dependency.
     target = ["--no-build-isolation", "--no-index", "--target", str(folder / "site")]
@@ -67,7 +69,7 @@ def example(
 def swept(example: Installed, smoke_variants: Path) -> tuple[int, str, str]:
     """A sweep with the example's own ablation file."""
     shutil.copytree(smoke_variants, example.folder / "s" / "variants")
-    conf = ("--config-dir", str(example.folder / "new_component" / "conf"))
+    conf = ("--config-dir", str(example.folder / "arms" / "conf"))
     return example.sweep(*conf, f"+ablation={NAME}", *CELL)
 
 
@@ -79,16 +81,18 @@ def test_the_sweep_ends_with_a_table_of_the_component(swept: tuple[int, str, str
 
 def test_the_component_is_in_the_history(example: Installed, swept: tuple[int, str, str]) -> None:
     with (example.cell() / "history.csv").open() as file:
-        first = next(csv.DictReader(file))
-    # Every Gaussian starts with an opacity of 0.1.
-    assert float(first["opacity_regularizer.term"]) == pytest.approx(0.01 * 0.1, rel=1e-4)
+        *_, third, last = csv.DictReader(file)
+    # Two steps after densification, on views that had no such step before: none is skipped.
+    assert [{row[f"{NAME}.{tag}"] for tag in ("HR", "LR")} for row in (third, last)] == [
+        {"", "0.0"},
+        {"", "0.0"},
+    ]
 
 
 def test_a_plan_names_what_is_not_installed(
     example: Installed, swept: tuple[int, str, str]
 ) -> None:
-    weight = f"+components.plugins.{NAME}.weight=0.01"
-    code, _, err = example.sweep(weight, *CELL, "dry_run=true", installed=False)
+    code, _, err = example.sweep(*SETTINGS, *CELL, "dry_run=true", installed=False)
     assert code == 1
     assert f"components.plugins.{NAME}: no installed package offers" in err
 
@@ -98,8 +102,7 @@ def test_an_edit_of_the_source_is_another_cell(
 ) -> None:
     def planned() -> str:
         """The id of the cell in the plan, by its settings on the command line."""
-        weight = f"+components.plugins.{NAME}.weight=0.01"
-        code, out, err = example.sweep(weight, *CELL, "dry_run=true")
+        code, out, err = example.sweep(*SETTINGS, *CELL, "dry_run=true")
         assert code == 0, err
         (line,) = (line for line in (out + err).splitlines() if f"plugins.{NAME}" in line)
         (found,) = re.findall(r"\b[0-9a-f]{16}\b", line)

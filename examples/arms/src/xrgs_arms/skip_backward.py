@@ -4,15 +4,27 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Self
+from dataclasses import dataclass
+from typing import Any, Self
 
 from torch import Tensor
 
 from xrgs.errors import XrgsError
-from xrgs.training.components.base import Component, Step, TrainingSetup, check_not_negative
+from xrgs.training.components import Component, Step, TrainingSetup, check_not_negative
 
-if TYPE_CHECKING:
-    from xrgs.config import SkipBackwardConf
+
+@dataclass
+class Settings:
+    """The keys under `components.plugins.skip_backward` of the config."""
+
+    share: float = 1.0
+    """The least share of the steps from `begin` on that have a backward pass; 1 is off."""
+    tolerance: float = 0.0
+    """How far above the view's mean the loss of a skipped step may be, relative."""
+    decay: float = 0.95
+    """The decay of the running mean of a view's loss, per step on the view; SkipGS's value."""
+    begin: int = 15_000
+    """The step of a 30,000-step run from which on steps may be skipped: densification's end."""
 
 
 class SkipBackward(Component):
@@ -37,7 +49,9 @@ class SkipBackward(Component):
     short training `share` alone decides how many steps are skipped.
     """
 
-    def __init__(self, settings: SkipBackwardConf) -> None:
+    settings_type = Settings
+
+    def __init__(self, settings: Settings) -> None:
         """Start without any mean."""
         self.settings = settings
         self.means: dict[str, float] = {}
@@ -45,14 +59,14 @@ class SkipBackward(Component):
         self.backward_passes = 0
 
     @classmethod
-    def from_settings(cls, settings: SkipBackwardConf, setup: TrainingSetup) -> Self | None:
+    def from_settings(cls, settings: Settings, setup: TrainingSetup) -> Self | None:
         """Build the component; a `share` of 1 leaves it off.
 
         Raises:
             XrgsError: A setting is out of its range.
         """
         del setup
-        key = "components.skip_backward"
+        key = "components.plugins.skip_backward"
         for name in ("tolerance", "begin"):
             check_not_negative(f"{key}.{name}", getattr(settings, name))
         if not 0 <= settings.share <= 1:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Self
 
 import torch
@@ -10,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from xrgs.errors import XrgsError
-from xrgs.training.components.base import (
+from xrgs.training.components import (
     Component,
     Step,
     TrainingSetup,
@@ -21,8 +22,31 @@ from xrgs.training.components.base import (
 from xrgs.training.seeding import seeded_generator
 
 if TYPE_CHECKING:
-    from xrgs.config import ErrorScoreConf, MultiviewScoreConf
     from xrgs.splat.gaussians import Gaussians
+
+
+@dataclass
+class MultiviewSettings:
+    """The keys under `components.plugins.multiview_score` of the config."""
+
+    views: int = 0
+    """Training views that each refinement looks at; 0 is off; FastGS has 10."""
+    error: float = 0.1
+    """The share of a view's largest error from which on an error is high; FastGS's value."""
+    pixels: float = 0.0
+    """Pixels with a high error, weighted as they are blended, px^2 of the finest view, above which
+    a Gaussian may grow. FastGS counts pixels without a weight and has 5."""
+
+
+@dataclass
+class ErrorSettings:
+    """The keys under `components.plugins.error_score` of the config."""
+
+    of: str = "nothing"
+    """What Gaussians are ranked by: `edges` of the photographs that they show, `errors` of the
+    renders, or `nothing` (off: the image-plane gradient)."""
+    views: int = 10
+    """Training views that each refinement looks at; Improved-GS's value."""
 
 
 class _ViewScores(Component):
@@ -83,24 +107,30 @@ class MultiviewScore(_ViewScores):
     densification is what `natural_selection` is for.
     """
 
+    settings_type = MultiviewSettings
+
     def __init__(
-        self, settings: MultiviewScoreConf, views: Sequence[TrainingView], seed: int
+        self, settings: MultiviewSettings, views: Sequence[TrainingView], seed: int
     ) -> None:
         """Take the settings, all training views and the seed of the run."""
         super().__init__(views, settings.views, seed)
         self.error, self.pixels = settings.error, settings.pixels
 
     @classmethod
-    def from_settings(cls, settings: MultiviewScoreConf, setup: TrainingSetup) -> Self | None:
+    def from_settings(cls, settings: MultiviewSettings, setup: TrainingSetup) -> Self | None:
         """Build the component; 0 `views` leave it off.
 
         Raises:
             XrgsError: A value is below 0, or the error above 1.
         """
         for name in ("views", "error", "pixels"):
-            check_not_negative(f"components.multiview_score.{name}", getattr(settings, name))
+            check_not_negative(
+                f"components.plugins.multiview_score.{name}", getattr(settings, name)
+            )
         if settings.error >= 1:
-            raise XrgsError(f"components.multiview_score.error={settings.error}: must be below 1")
+            raise XrgsError(
+                f"components.plugins.multiview_score.error={settings.error}: must be below 1"
+            )
         return cls(settings, setup.data.train, setup.seed) if settings.views else None
 
     def may_grow(self, gaussians: Gaussians, step: Step) -> Tensor:
@@ -137,24 +167,25 @@ class ErrorScore(_ViewScores):
     negative values off, and the highest scores instead of a random choice by them.
     """
 
-    def __init__(self, settings: ErrorScoreConf, views: Sequence[TrainingView], seed: int) -> None:
+    settings_type = ErrorSettings
+
+    def __init__(self, settings: ErrorSettings, views: Sequence[TrainingView], seed: int) -> None:
         """Take the settings, all training views and the seed of the run."""
         super().__init__(views, settings.views, seed)
         self.of = settings.of
 
     @classmethod
-    def from_settings(cls, settings: ErrorScoreConf, setup: TrainingSetup) -> Self | None:
+    def from_settings(cls, settings: ErrorSettings, setup: TrainingSetup) -> Self | None:
         """Build the component; `of: nothing` leaves it off.
 
         Raises:
             XrgsError: `of` is unknown, or there are no views.
         """
+        key = "components.plugins.error_score"
         if settings.of not in ("nothing", "edges", "errors"):
-            raise XrgsError(
-                f"components.error_score.of={settings.of}: must be nothing, edges or errors"
-            )
+            raise XrgsError(f"{key}.of={settings.of}: must be nothing, edges or errors")
         if settings.views < 1:
-            raise XrgsError(f"components.error_score.views={settings.views}: must be at least 1")
+            raise XrgsError(f"{key}.views={settings.views}: must be at least 1")
         return None if settings.of == "nothing" else cls(settings, setup.data.train, setup.seed)
 
     def growth_scores(self, gaussians: Gaussians, step: Step) -> Tensor:

@@ -13,17 +13,17 @@ from scipy.optimize import minimize_scalar
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from tests.conftest import composed
+from examples.arms.tests.conftest import with_arms
 from tests.splat.scenes import noise
 from tests.training.components.conftest import make_view
 from tests.training.conftest import same
-from xrgs.config import ComponentsConf, NoiseWeightingConf
+from xrgs.config import ComponentsConf
 from xrgs.errors import XrgsError
 from xrgs.splat.gaussians import Gaussians
 from xrgs.training.components import Components, Step
-from xrgs.training.components.noise_weighting import NoiseWeighting
 from xrgs.training.dataset import Dataset, LoadedView
 from xrgs.training.loop import train
+from xrgs_arms.noise_weighting import NoiseWeighting, Settings
 
 Build = Callable[..., Components]
 NO_GAUSSIANS = Gaussians(*[torch.empty(0)] * 6)
@@ -41,7 +41,7 @@ VIEWS = {
 
 
 def weighting(floor: float = 0.1) -> NoiseWeighting:
-    return NoiseWeighting(NoiseWeightingConf(floor=floor, begin=15_000), [*VIEWS.values()])
+    return NoiseWeighting(Settings(floor), [*VIEWS.values()])
 
 
 def take(
@@ -132,11 +132,26 @@ def test_a_perfect_render_and_a_view_before_any_hr_view_weigh_1() -> None:
 
 
 def test_it_needs_an_hr_view(build: Build, off: ComponentsConf) -> None:
-    off.noise_weighting.floor = 0.25
+    off.plugins["noise_weighting"] = {"floor": 0.25}
     with pytest.raises(
-        XrgsError, match=r"^components\.noise_weighting\.floor=0\.25: .* no HR view"
+        XrgsError, match=r"^components\.plugins\.noise_weighting\.floor=0\.25: .* no HR view"
     ):
         build(off, view("l0", "LR"))
+
+
+@pytest.mark.parametrize("setting", [{"floor": -0.1}, {"floor": 1.1}, {"begin": -1}])
+def test_a_value_out_of_range_names_its_key(
+    setting: dict[str, float], build: Build, off: ComponentsConf
+) -> None:
+    off.plugins["noise_weighting"] = {"floor": 0.25} | setting
+    ((name, value),) = setting.items()
+    with pytest.raises(XrgsError, match=rf"^components\.plugins\.noise_weighting\.{name}={value}"):
+        build(off)
+
+
+def test_a_floor_of_1_is_off(build: Build, off: ComponentsConf) -> None:
+    off.plugins["noise_weighting"] = {"floor": 1.0}
+    assert build(off) == ()
 
 
 @pytest.fixture
@@ -151,7 +166,7 @@ def test_a_noisy_photograph_weighs_less_in_training(
 ) -> None:
     settings = ("train.steps=300", "splat.backend=auto", "splat.densify.stop=15000")
     with caplog.at_level(logging.INFO):
-        result = train(noisy, composed(*settings, "+ablation=noise_weighting"))
+        result = train(noisy, with_arms(*settings, "+ablation=noise_weighting"))
     assert (
         "noise_weighting: the weights of the LR photographs are 0.250 (v3) to 1.000 (v1)"
         in caplog.text
@@ -160,4 +175,4 @@ def test_a_noisy_photograph_weighs_less_in_training(
     assert {row["noise_weighting.LR"] for row in before} == {None}
     weights = {row["view"]: row["noise_weighting.LR"] for row in after}
     assert weights == {"v0": None, "v1": 1, "v2": None, "v3": 0.25}
-    assert not same(result.gaussians, train(noisy, composed(*settings)).gaussians)
+    assert not same(result.gaussians, train(noisy, with_arms(*settings)).gaussians)
