@@ -136,8 +136,9 @@ function startCurves() {
     const charts = scores.map((score) => chart(`${score.label} of the test views`, withMeans(seriesFrom(data.curves, over.value, score.name)), OVER[over.value], score.label));
     charts.push(chart("Gaussians", withMeans(seriesFrom(data.history, "step", "gaussians")), OVER.step, "Gaussians"));
     if (rule.value) charts.push(chart(RULES[rule.value], withMeans(seriesFrom(data.history, "step", rule.value)), OVER.step, "so far"));
-    body.replaceChildren(...charts);
-    const used = labels.filter((label) => passes({ label, scene: filters.scene }));
+    // A short training measures nothing on its way, which filters can't change on the page of one label.
+    body.replaceChildren(...charts.filter((one) => !data.alone || one.querySelector("svg")));
+    const used = data.alone && labels.length < 2 ? [] : labels.filter((label) => passes({ label, scene: filters.scene }));
     document.getElementById("curves-legend").replaceChildren(...legend(used));
   };
   over.addEventListener("change", draw);
