@@ -37,8 +37,8 @@ _SAME_ANGLE, _SAME_PLACE = 0.1, 0.01
 _MIXTURE_FROM = 0.25
 #: The recipe (a file of `conf/ablation/`) for a mixture, and the one for photographs alike.
 MIXTURE_RECIPE, ALIKE_RECIPE = "plus", "tuned_baseline"
-#: How the note begins that undegraded photographs differ too little for HR and LR, and how all notes
-#: begin that say what a split into HR and LR views is worth.
+#: How the note begins that undegraded photographs differ too little for HR and LR, and how all
+#: notes begin that say what a split into HR and LR views is worth.
 _MEANINGLESS = "the split by variant.tags="
 _OF_SPLITS = (_MEANINGLESS, "sampling rates of training views differ by")
 

@@ -94,7 +94,8 @@ def _run_job(cfg: DictConfig) -> str:
     from xrgs.sweep.session import SweepSession
 
     hydra_conf = HydraConfig.get()
-    session = SweepSession(Path(hydra_conf.sweep.dir), hydra_conf.sweeper.brief)
+    brief = OmegaConf.select(hydra_conf, "sweeper.brief", default=False)
+    session = SweepSession(Path(hydra_conf.sweep.dir), brief)
     outcome = run_job(session, Store(Path(cfg.store)), cfg.cell, cfg.name)
     if session.owner_dead:  # a worker of joblib would wait for ever to hand over its answer
         os._exit(os.EX_TEMPFAIL)

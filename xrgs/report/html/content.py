@@ -258,14 +258,14 @@ def page_context(
     """
     cells = comparison.cells
     done = cells[cells["cell_id"].isin(sweep.done)].drop_duplicates("cell_id")
-    replicates = done.drop_duplicates(["variant_seed", "seed"])
+    replicates, planned = done.drop_duplicates(["variant_seed", "seed"]), cells["cell_id"].nunique()
     of_many = [
         ("Compared with", shown(comparison.base) if comparison.groups else ""),
         ("Scenes", ", ".join(map(shown, comparison.scenes))),
         ("Replicates (variant.seed/seed)", _listed(_replicates(replicates))),
-        ("Cells", f"{len(done)} of {cells['cell_id'].nunique()} are done"),
+        ("Cells", f"{len(done)} of {planned} are done"),
     ]
-    rows = of_many if cells["cell_id"].nunique() > 1 else []
+    rows = of_many if planned > 1 else []
     for condition, of in contexts.items():
         rows.append((shown(titled("Training and scores", condition)), of.of_scores))
         rows.append((shown(titled("Times", condition)), of.of_times))
