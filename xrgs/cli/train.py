@@ -47,8 +47,6 @@ _QUALITIES = {
 #: Steps from which on a run has the settings of `preset=paper`; and the steps of a shorter run
 #: between two refinements, those of `preset=laptop`: with fewer, more grows than it can train.
 _LONG_RUN, _REFINED_EVERY = 10_000, 50
-#: The most notes on photographs that are printed; where there are more, the page has them.
-_MOST_NOTES = 1
 
 
 @dataclass(frozen=True)
@@ -193,8 +191,8 @@ def _look(words: _Words) -> _Found | None:
     if planned.error or planned.unknown:
         raise XrgsError(planned.error or f"{planned.unknown}; run the same command again")
     notes = planned.notes
-    if not conf.dry_run and len(notes) > _MOST_NOTES:
-        notes = (f"{len(notes)} notes on photographs left out or changed are on the page",)
+    if notes and not conf.dry_run:
+        notes = (f"{counted(len(notes), 'note')} on what was left out or changed: see the page",)
     for note in notes:
         _say(f"  {note}")
     if planned.id is None:
@@ -204,7 +202,7 @@ def _look(words: _Words) -> _Found | None:
     found = mixture(read_views(store.variants, planned.id))
     _say(f"{name}: the cameras of {report.registered} of {report.images} {kind}s are found")
     _say(
-        f"{name}: {'a mixture' if found.is_one else 'photographs alike'}: {found.coarse or 'none'}"
+        f"{name}: {'a mixture' if found.is_one else f'{kind}s alike'}: {found.coarse or 'none'}"
         f" of {found.views} to train on are 1.5 times or more as coarse as the finest"
     )
     return None if conf.dry_run else _Found(planned.id, found, report)
