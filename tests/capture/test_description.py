@@ -172,11 +172,12 @@ NEEDS = "sampling rates of training views differ by 1.1 where they show the same
 
 
 @pytest.mark.parametrize(
-    ("factor", "notes", "tagged", "said"),
+    ("factor", "degradation", "notes", "tagged", "said"),
     [
-        (1, (MEANINGLESS, NEEDS, "left out: a.gif"), False, ("left out: a.gif",)),
-        (1, (NEEDS,), True, ()),  # a mixture
-        (2, (MEANINGLESS, NEEDS), True, (MEANINGLESS, NEEDS)),  # of a study that asks for LR views
+        (1, "none", (MEANINGLESS, NEEDS, "left out: a.gif"), False, ("left out: a.gif",)),
+        (1, "none", (NEEDS,), True, ()),  # a mixture
+        (1, "jpeg", (NEEDS,), True, (NEEDS,)),
+        (2, "none", (MEANINGLESS, NEEDS), True, (MEANINGLESS, NEEDS)),  # a study asks for LR views
     ],
 )
 def test_photographs_as_they_are_are_described_without_a_split(
@@ -184,6 +185,7 @@ def test_photographs_as_they_are_are_described_without_a_split(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     factor: int,
+    degradation: str,
     notes: tuple[str, ...],
     tagged: bool,
     said: tuple[str, ...],
@@ -192,7 +194,7 @@ def test_photographs_as_they_are_are_described_without_a_split(
         "images": 3,
         "registered": 3,
         "tags": "sampling_rate",
-        "degradation": "none",
+        "degradation": degradation,
         "lr_images": "upsampled",
         "max_num_features": 9,
         "hr": ["a"],

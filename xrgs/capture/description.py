@@ -5,6 +5,7 @@ Nothing here imports torch.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -85,7 +86,7 @@ class SfmReport(Struct):
     lr: tuple[str, ...] = ()
     not_registered: tuple[str, ...] = ()
     as_they_are: bool = False
-    """Whether nothing was to be degraded (`variant.factor=1`): nobody asked for LR views."""
+    """Whether nothing is degraded and `variant.factor` is 1: nobody asked for LR views."""
 
     @property
     def alike(self) -> bool:
@@ -146,7 +147,8 @@ def read_report(folder: Path) -> SfmReport:
         return report
     manifest = read_manifest(folder)
     notes = (*report.notes, *shared_cameras(manifest))
-    return structs.replace(report, notes=notes, as_they_are=manifest.factor == 1)
+    as_they_are = manifest.factor == 1 and report.degradation == "none"
+    return structs.replace(report, notes=notes, as_they_are=as_they_are)
 
 
 def shared_cameras(manifest: Manifest) -> list[str]:
@@ -222,13 +224,18 @@ def views_table(frozen: Variant, report: SfmReport) -> TextTable:
     for name in report.not_registered:
         split = "train" if name in {*report.hr, *report.lr} else "test"
         rows.append((name, split, "LR" if name in report.lr else "HR", "", "", "no"))
-    columns, align = ("View", "Split", "Tag", "Size, px", "rho", "Placed"), "lllrrl"
+    columns = ("View", "Split", "Tag", "Size, px", "rho", "Placed")
     title = f"{frozen.scene}, variant {frozen.id}, factor {frozen.factor}"
-    if report.tagless:
-        rows = [(name, split, *others) for name, split, _, *others in rows]
-        columns, align = tuple(name for name in columns if name != "Tag"), "llrrl"
     notes = tuple(_counts(frozen, tagless=report.tagless))
-    return TextTable(title, columns, tuple(sorted(rows)), align, notes)
+    table = TextTable(title, columns, tuple(sorted(rows)), "lllrrl", notes)
+    return _without_column(table, "Tag") if report.tagless else table
+
+
+def _without_column(table: TextTable, name: str) -> TextTable:
+    at = table.columns.index(name)
+    columns, *rows = (row[:at] + row[at + 1 :] for row in (table.columns, *table.rows))
+    align = table.align[:at] + table.align[at + 1 :]
+    return replace(table, columns=columns, rows=tuple(rows), align=align)
 
 
 def _counts(frozen: Variant, *, tagless: bool) -> Iterator[str]:

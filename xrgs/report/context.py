@@ -212,10 +212,8 @@ def _cautions_of_photographs(rows: pd.DataFrame, sweep: Sweep) -> list[str]:
             if (report := sweep.variants.get(row["variant_id"])) is None:
                 continue
             config = sweep.done[row["cell_id"]].config
-            wants_lr = config is None or (
-                config.variant.factor > 1 and _mixture(config.variant) != _ALL_HR
-            )
-            unmixed |= wants_lr and bool(report.hr) and not report.lr
+            wants_lr = config is None or _mixture(config.variant) != _ALL_HR
+            unmixed |= wants_lr and not report.as_they_are and bool(report.hr) and not report.lr
             if row["validation"] == 0:
                 unscored |= dict.fromkeys(report.not_scored)
         if unscored:
