@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -120,6 +121,28 @@ def test_minutes_choose_size_and_steps_which_the_user_may_replace(
     assert words["preset"] == "laptop"
     fixed = handed_over(Mixture(0, 8), "garden", "--minutes", "10", "train.steps=5", "--size", "99")
     assert (fixed["train.steps"], fixed["variant.long_side"]) == ("5", "99")
+
+
+@pytest.mark.usefixtures("garden")
+@pytest.mark.parametrize(
+    "more",
+    [[], ["--all"], ["--recipe", "lean"], ["--masks", "m"], ["--store", "my store", "seed=3"]],
+)
+@pytest.mark.parametrize("minutes", ["1", "10"])
+def test_the_command_that_minutes_prints_makes_the_same_cell(
+    handed_over: Callable[..., dict[str, str]],
+    monkeypatch: pytest.MonkeyPatch,
+    minutes: str,
+    more: list[str],
+) -> None:
+    said: list[str] = []
+    monkeypatch.setattr(train, "_say", said.append)
+    chosen = handed_over(Mixture(3, 8), "garden", "--minutes", minutes, *more)
+    (line,) = (line for line in said if line.startswith(f"chosen for {minutes} min; "))
+    again = shlex.split(line.partition(": ")[2])
+    assert again[:2] == ["xrgs-train", "garden"]
+    assert "--minutes" not in again
+    assert handed_over(Mixture(3, 8), *again[1:]) == chosen
 
 
 def test_more_time_gives_larger_views_and_more_steps_and_never_exceeds_the_time() -> None:

@@ -97,13 +97,19 @@ def test_views_that_are_not_placed_are_named_beside_the_scores(made: Any) -> Non
 
 
 @pytest.mark.parametrize(
-    ("lr", "hr_fraction", "said"), [((), 0.5, True), (("b",), 0.5, False), ((), 1.0, False)]
+    ("lr", "hr_fraction", "as_they_are", "said"),
+    [
+        ((), 0.5, False, True),
+        (("b",), 0.5, False, False),
+        ((), 1.0, False, False),
+        ((), 0.5, True, False),  # nobody asked for LR views
+    ],
 )
 def test_a_mixture_without_lr_views_is_cautioned(
-    made: Any, lr: tuple[str, ...], hr_fraction: float, said: bool
+    made: Any, lr: tuple[str, ...], hr_fraction: float, as_they_are: bool, said: bool
 ) -> None:
     configured(made.add(variant="v"), variant={"hr_fraction": hr_fraction})
-    report = SfmReport(tests=1, hr=("a",), lr=lr)
+    report = SfmReport(tests=1, hr=("a",), lr=lr, as_they_are=as_they_are)
     cautions = contexts(replace(made.read(), variants={"v": report}))[""].cautions
     assert ("Caution: fern has no LR view: nothing is mixed" in cautions) == said
 

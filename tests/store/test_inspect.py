@@ -169,6 +169,55 @@ def test_the_table_has_a_row_a_view_and_leaves_originals_out(mixed: Variant) -> 
     assert "originals of degraded views kept beside them: 1" in text
 
 
+MEANINGLESS = "the split by variant.tags=sampling_rate is meaningless: rho is 0.916 to 1.000"
+NEEDS = "sampling rates of training views differ by 1.1 where they show the same points: none"
+
+
+@pytest.mark.parametrize(
+    ("factor", "degradation", "notes", "tagged", "said"),
+    [
+        (1, "none", (MEANINGLESS, NEEDS, "left out: a.gif"), False, ("left out: a.gif",)),
+        (1, "none", (NEEDS,), True, ()),  # a mixture
+        (1, "jpeg", (NEEDS,), True, (NEEDS,)),
+        (2, "none", (MEANINGLESS, NEEDS), True, (MEANINGLESS, NEEDS)),  # a study asks for LR views
+    ],
+)
+def test_photographs_as_they_are_are_described_without_a_split(
+    mixed: Variant,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    factor: int,
+    degradation: str,
+    notes: tuple[str, ...],
+    tagged: bool,
+    said: tuple[str, ...],
+) -> None:
+    content = {
+        "images": 3,
+        "registered": 3,
+        "tags": "sampling_rate",
+        "degradation": degradation,
+        "lr_images": "upsampled",
+        "max_num_features": 9,
+        "hr": ["a"],
+        "lr": ["b-low"],
+        "sampling_rate": {"HR": [1, 1, 1], "LR": [0.9, 0.9, 0.9]},
+        "lr_blur": 0.3,
+        "notes": notes,
+    }
+    (tmp_path / "report.json").write_text(json.dumps(content))
+    entry = ViewEntry("a", "train", "", "HR", 9, 9, np.eye(3).tolist(), np.eye(4).tolist(), 1.0)
+    manifest = Manifest("k", "s", factor, True, (entry,), {})
+    monkeypatch.setattr(inspect, "read_manifest", lambda _: manifest)
+    monkeypatch.setattr(variant, "load", lambda _: replace(mixed, factor=factor))
+    assert inspect.read_report(tmp_path).all_notes() == said
+    text = describe(tmp_path, tmp_path / "sheet.png")
+    words = {"HR", "LR", "Tag", "tags"} & set(re.findall(r"\w+", text))
+    assert words == ({"HR", "LR", "Tag", "tags"} if tagged else set())
+    for note in notes:
+        assert (note in text) == (note in said)
+
+
 @pytest.mark.parametrize(
     ("needs", "said"),
     [
@@ -345,7 +394,7 @@ def test_only_so_many_views_are_drawn(mixed: Variant, monkeypatch: pytest.Monkey
 
 @pytest.mark.parametrize(
     ("wrong", "field"),
-    [({"lr": 5}, "lr"), ({"rho": {"HR": ["a"]}}, "rho"), ({"attempts": [1]}, r"attempts\[0\]")],
+    [({"lr": 5}, "lr"), ({"sampling_rate": {"HR": ["a"]}}, "rho"), ({"attempts": [1]}, r"attempts\[0\]")],
 )
 def test_a_damaged_report_is_named_with_its_field(
     tmp_path: Path, wrong: dict[str, Any], field: str

@@ -93,6 +93,20 @@ def test_states_are_read_from_the_cells_files_alone(watched: Watched) -> None:
     assert str(monitor.snapshot()).startswith("2 of 6 cells done, 3 failed, ~15 s left")
 
 
+def test_a_single_training_is_shown_without_the_words_of_a_study(
+    watched: Watched, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(monitor_module, "_LINE_S", -1.0)
+    with SweepMonitor(watched.store.cells_folder, brief=True) as monitor:
+        monitor._stop.set()  # this test looks by itself
+        monitor.watch([watched.plan("a")])
+        watched.begin("a")
+        watched.step("a", 20, 10.0)
+        monitor._show(monitor.snapshot())
+        watched.finish("a")
+    assert capsys.readouterr().err == "training 20 of 100 steps, 10 steps/s, ~8 s left\n"
+
+
 def test_progress_never_goes_back(watched: Watched, monkeypatch: pytest.MonkeyPatch) -> None:
     """A cell has no progress file for a moment between its evaluation and its end."""
     monitor = SweepMonitor(watched.store.cells_folder)

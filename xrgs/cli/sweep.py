@@ -93,7 +93,9 @@ def _run_job(cfg: DictConfig) -> str:
     from xrgs.sweep.jobs.job import INTERRUPTED, run_job
     from xrgs.sweep.session import SweepSession
 
-    session = SweepSession(Path(HydraConfig.get().sweep.dir))
+    hydra_conf: Any = HydraConfig.get()
+    brief = OmegaConf.select(hydra_conf, "sweeper.brief", default=False)
+    session = SweepSession(Path(hydra_conf.sweep.dir), brief)
     outcome = run_job(session, Store(Path(cfg.store)), cfg.cell, cfg.name)
     if session.owner_dead:  # a worker of joblib would wait for ever to hand over its answer
         os._exit(os.EX_TEMPFAIL)

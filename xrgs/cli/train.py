@@ -47,8 +47,6 @@ _QUALITIES = {
 #: Steps from which on a run has the settings of `preset=paper`; and the steps of a shorter run
 #: between two refinements, those of `preset=laptop`: with fewer, more grows than it can train.
 _LONG_RUN, _REFINED_EVERY = 10_000, 50
-#: How the notes on photographs begin that are for studies.
-_FOR_STUDIES = ("the split by variant.tags=", "sampling rates of training views differ by")
 
 
 @dataclass(frozen=True)
@@ -192,9 +190,11 @@ def _look(words: _Words) -> _Found | None:
     (planned,) = build_variants.plan([conf], store, allow_build=not conf.dry_run)
     if planned.error:
         raise XrgsError(planned.error)
-    for note in planned.notes:
-        if not note.startswith(_FOR_STUDIES):
-            _say(f"  {note}")
+    notes = planned.notes
+    if notes and not conf.dry_run:
+        notes = (f"{counted(len(notes), 'note')} on what was left out or changed: see the page",)
+    for note in notes:
+        _say(f"  {note}")
     if planned.id is None:
         _say("without --dry-run, their cameras are found, and a recipe is chosen for what they are")
         return None
@@ -202,8 +202,8 @@ def _look(words: _Words) -> _Found | None:
     found = mixture(read_views(store.variants, planned.id))
     _say(f"{name}: the cameras of {report.registered} of {report.images} {kind}s are found")
     _say(
-        f"{name}: {'a mixture' if found.is_one else 'photographs alike'}: {found.coarse} of"
-        f" {found.views} to train on are 1.5 times or more as coarse as the finest"
+        f"{name}: {'a mixture' if found.is_one else f'{kind}s alike'}: {found.coarse or 'none'}"
+        f" of {found.views} to train on are 1.5 times or more as coarse as the finest"
     )
     return None if conf.dry_run else _Found(planned.id, found, report)
 

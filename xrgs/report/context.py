@@ -13,7 +13,6 @@ import pandas as pd
 
 from xrgs.mixture.degradations import DEGRADATIONS, resolve_degradation
 from xrgs.report.inference import OTHER_CODE
-from xrgs.report.photographs import alike
 from xrgs.report.writing import signed
 from xrgs.runtime.text import listed
 from xrgs.safeio.sanitize import counted, for_line
@@ -80,7 +79,7 @@ def contexts(sweep: Sweep) -> dict[str, Context]:
         made = [sweep.done[cell_id] for cell_id in rows["cell_id"]]
         configs = [cell.config for cell in made]
         reports = [sweep.variants.get(name) for name in rows["variant_id"]]
-        tagged = not all(report and alike(report) for report in reports)
+        tagged = not all(report and report.alike for report in reports)
         held_out = bool((rows["validation"] > 0).any())
         found[str(condition)] = Context(
             (
@@ -214,7 +213,7 @@ def _cautions_of_photographs(rows: pd.DataFrame, sweep: Sweep) -> list[str]:
                 continue
             config = sweep.done[row["cell_id"]].config
             wants_lr = config is None or _mixture(config.variant) != _ALL_HR
-            unmixed |= wants_lr and bool(report.hr) and not report.lr
+            unmixed |= wants_lr and not report.as_they_are and bool(report.hr) and not report.lr
             if row["validation"] == 0:
                 unscored |= dict.fromkeys(report.not_scored)
         if unscored:

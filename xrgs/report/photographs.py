@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
 #: The most names in a sentence on views that are not placed: all that a scene is likely to have.
 _MAX_NAMES = 200
-#: How the note begins that photographs, which are not degraded, differ too little for HR and LR.
-_MEANINGLESS = "the split by variant.tags="
 
 
 def with_variants(sweep: Sweep, store: ReportStore) -> Sweep:
@@ -51,17 +49,6 @@ def photographs(sweep: Sweep) -> list[tuple[str, tuple[str, ...]]]:
         notes = [note for variant in variants for note in variant.all_notes(_MAX_NAMES)]
         found.append((str(scene), tuple(dict.fromkeys([*notes, *_found(sweep, rows)]))))
     return [(scene, notes) for scene, notes in found if notes]
-
-
-def alike(report: SfmReport) -> bool:
-    """Return whether a scene's photographs are of one resolution, so that HR and LR tell nothing.
-
-    Args:
-        report: The report of a variant. Degraded photographs are never alike.
-    """
-    if report.degradation != "none":
-        return bool(report.hr) and not report.lr
-    return not (report.hr and report.lr) or any(n.startswith(_MEANINGLESS) for n in report.notes)
 
 
 def placement(sweep: Sweep, scene: str) -> str:

@@ -5,6 +5,7 @@ Nothing here imports torch.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -38,6 +39,10 @@ _SAME_ANGLE, _SAME_PLACE = 0.1, 0.01
 _MIXTURE_FROM = 0.25
 #: The recipe (a file of `conf/ablation/`) for a mixture, and the one for photographs alike.
 MIXTURE_RECIPE, ALIKE_RECIPE = "plus", "tuned_baseline"
+#: How the note begins that undegraded photographs differ too little for HR and LR, and how all
+#: notes begin that say what a split into HR and LR views is worth.
+_MEANINGLESS = "the split by variant.tags="
+_OF_SPLITS = (_MEANINGLESS, "sampling rates of training views differ by")
 
 
 class SfmAttempt(Struct):
@@ -81,6 +86,29 @@ class SfmReport(Struct):
     hr: tuple[str, ...] = ()
     lr: tuple[str, ...] = ()
     not_registered: tuple[str, ...] = ()
+    as_they_are: bool = False
+    """Whether nothing is degraded and `variant.factor` is 1: nobody asked for LR views."""
+
+    @property
+    def alike(self) -> bool:
+        """Whether the photographs are of one resolution, so that HR and LR tell nothing.
+
+        Degraded photographs are never alike.
+        """
+        if self.degradation != "none":
+            return bool(self.hr) and not self.lr
+        return not (self.hr and self.lr) or any(n.startswith(_MEANINGLESS) for n in self.notes)
+
+    @property
+    def tagless(self) -> bool:
+        """Whether photographs as they are turned out alike, so that no tag is worth a word."""
+        return self.as_they_are and self.alike
+
+    @property
+    def own_notes(self) -> tuple[str, ...]:
+        """The notes, without those on a split that nobody asked for."""
+        splits = _OF_SPLITS if self.as_they_are else ()
+        return tuple(note for note in self.notes if not note.startswith(splits))
 
     @property
     def not_trained(self) -> tuple[str, ...]:
@@ -101,12 +129,12 @@ class SfmReport(Struct):
             most: The most names in such a sentence.
         """
         if not (self.hr or self.lr):  # of a scene that failed: the reason names the views
-            return self.notes
+            return self.own_notes
         lost = (("trained on", self.not_trained), ("scored", self.not_scored))
         unplaced = [
             f"not placed, and so not {done}: {listed(names, most)}" for done, names in lost if names
         ]
-        return (*self.notes, *unplaced)
+        return (*self.own_notes, *unplaced)
 
 
 def read_report(folder: Path) -> SfmReport:
@@ -118,7 +146,10 @@ def read_report(folder: Path) -> SfmReport:
     report = read_struct(folder / REPORT, SfmReport)
     if is_failed(folder.name):
         return report
-    return structs.replace(report, notes=(*report.notes, *shared_cameras(read_manifest(folder))))
+    manifest = read_manifest(folder)
+    notes = (*report.notes, *shared_cameras(manifest))
+    as_they_are = manifest.factor == 1 and report.degradation == "none"
+    return structs.replace(report, notes=notes, as_they_are=as_they_are)
 
 
 def shared_cameras(manifest: Manifest) -> list[str]:
@@ -196,14 +227,24 @@ def views_table(frozen: Variant, report: SfmReport) -> TextTable:
         rows.append((name, split, "LR" if name in report.lr else "HR", "", "", "no"))
     columns = ("View", "Split", "Tag", "Size, px", "rho", "Placed")
     title = f"{frozen.scene}, variant {frozen.id}, factor {frozen.factor}"
-    return TextTable(title, columns, tuple(sorted(rows)), "lllrrl", tuple(_counts(frozen)))
+    notes = tuple(_counts(frozen, tagless=report.tagless))
+    table = TextTable(title, columns, tuple(sorted(rows)), "lllrrl", notes)
+    return _without_column(table, "Tag") if report.tagless else table
 
 
-def _counts(frozen: Variant) -> Iterator[str]:
+def _without_column(table: TextTable, name: str) -> TextTable:
+    at = table.columns.index(name)
+    columns, *rows = (row[:at] + row[at + 1 :] for row in (table.columns, *table.rows))
+    align = table.align[:at] + table.align[at + 1 :]
+    return replace(table, columns=columns, rows=tuple(rows), align=align)
+
+
+def _counts(frozen: Variant, *, tagless: bool) -> Iterator[str]:
     train = [view.tag for view in frozen.views if view.split == "train"]
     tests = sum(view.split == "test" for view in frozen.views)
     kind = "held out" if frozen.held_out else "tests, at the trained poses"
-    yield f"{train.count('HR')} HR and {train.count('LR')} LR to train on, {tests} {kind}"
+    trained = f"{train.count('HR')} HR and {train.count('LR')} LR"
+    yield f"{len(train) if tagless else trained} to train on, {tests} {kind}"
     if originals := sum(view.split == "original" for view in frozen.views):
         yield f"originals of degraded views kept beside them: {originals}"
 
@@ -254,23 +295,29 @@ def _sfm(report: SfmReport) -> Iterator[str]:
         + (f", {error:.2f} px" if error is not None else "")
     )
     if report.lr_images is not None:
-        yield f"  LR images {report.lr_images}, {report.max_num_features} features a view"
+        lr = "" if report.tagless else f"LR images {report.lr_images}, "
+        yield f"  {lr}{report.max_num_features} features a view"
     for attempt in report.attempts:
         verdict = attempt.refused or f"accepted, {attempt.registered} placed"
         yield f"  recipe {attempt.attempt}: {verdict}"
-    if report.tags is not None:
+    if report.tags is not None and not report.tagless:
         yield f"  tags by {report.tags}, degradation {report.degradation}"
-    yield from (f"  {note}" for note in report.notes)
+    yield from (f"  {note}" for note in report.own_notes)
     if report.pose_error:
         yield f"  poses against {report.pose_error_against}: " + "; ".join(_pose(report.pose_error))
+    if not report.tagless:
+        yield from _classes(report)
+    if report.not_registered:
+        yield f"  not placed: {', '.join(report.not_registered)}"
+
+
+def _classes(report: SfmReport) -> Iterator[str]:
     for tag in ("HR", "LR"):
         if rates := report.rho.get(tag):
             numbers = ", ".join(f"{rate:.3f}" for rate in rates)
             yield f"  rho of {tag}: {numbers} (least, median, most)"
     if report.lr_blur is not None:
         yield f"  blur of LR: {report.lr_blur:.2f} px, estimated (a pixel's area has 0.29)"
-    if report.not_registered:
-        yield f"  not placed: {', '.join(report.not_registered)}"
 
 
 def _pose(error: dict[str, float]) -> Iterator[str]:

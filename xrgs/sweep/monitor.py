@@ -149,13 +149,22 @@ class SweepSnapshot:
             parts.append(f"{len(self.elsewhere)} in another sweep")
         if len(self.running) > 1:
             parts.append(f"{len(self.running)} in training")
-        if rate := sum(1 / cell.pace for cell in self.running if cell.pace):
-            parts.append(f"{rate:.3g} steps/s")
-        if self.left_s is not None:
-            parts.append(f"{format_duration(self.left_s)} left")
+        parts += self._pace_and_rest()
         if len(self.running) == 1:  # last: a narrow terminal cuts it off
             parts.append(f"{for_line(self.running[0].cell.name)}: {self.running[0].progress.count}")
         return ", ".join(parts)
+
+    @property
+    def of_one(self) -> str:
+        """The state of a single training, without the words of a study."""
+        counts = [cell.progress.count for cell in self.running] or ["training"]
+        return ", ".join([*counts, *self._pace_and_rest()])
+
+    def _pace_and_rest(self) -> list[str]:
+        rate = sum(1 / cell.pace for cell in self.running if cell.pace)
+        said = [f"{rate:.3g} steps/s"] if rate else []
+        left = self.left_s
+        return said if left is None else [*said, f"{format_duration(left)} left"]
 
 
 class _Slowness:
@@ -195,9 +204,14 @@ class _Slowness:
 class SweepMonitor:
     """Shows a sweep while a `with` block runs: a bar on a terminal, occasional lines in a log."""
 
-    def __init__(self, cells: Path) -> None:
-        """Prepare to show the cells of a folder; nothing is shown before `watch` is called."""
-        self._cells = cells
+    def __init__(self, cells: Path, *, brief: bool = False) -> None:
+        """Prepare to show the cells of a folder; nothing is shown before `watch` is called.
+
+        Args:
+            cells: The folder.
+            brief: Show how far a single training is, without the words of a study.
+        """
+        self._cells, self._brief = cells, brief
         self._plan: tuple[PlannedCell, ...] = ()
         self._retry = False
         self._before: dict[str, _FileStamp] = {}
@@ -247,7 +261,7 @@ class SweepMonitor:
             self._bar.close()
         if self._plan:
             snapshot = self.snapshot()
-            if snapshot.ended != self._shown:
+            if snapshot.ended != self._shown and not self._brief:
                 log_line(str(snapshot))
 
     def _folder(self, name: str) -> CellFolder:
@@ -345,8 +359,10 @@ class SweepMonitor:
     def _show(self, snapshot: SweepSnapshot) -> None:
         if is_terminal(sys.stderr):
             self._draw(snapshot)
-        elif snapshot.ended != self._shown or time.monotonic() - self._shown_at > _LINE_S:
-            log_line(str(snapshot))
+        elif (
+            snapshot.ended != self._shown and not self._brief
+        ) or time.monotonic() - self._shown_at > _LINE_S:
+            log_line(self._text(snapshot))
             self._shown, self._shown_at = snapshot.ended, time.monotonic()
 
     def _draw(self, snapshot: SweepSnapshot) -> None:
@@ -356,7 +372,10 @@ class SweepMonitor:
         # A training that starts again, as count_matched does, takes nothing back.
         shown = self._bar.n if self._bar.total == snapshot.total else 0
         self._bar.total, self._bar.n = snapshot.total, max(shown, snapshot.progress)
-        self._bar.set_description_str(str(snapshot))
+        self._bar.set_description_str(self._text(snapshot))
+
+    def _text(self, snapshot: SweepSnapshot) -> str:
+        return snapshot.of_one if self._brief else str(snapshot)
 
 
 def _stamp(file: Path) -> _FileStamp:

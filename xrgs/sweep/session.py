@@ -23,6 +23,8 @@ class SweepSession:
     """One call of `xrgs-sweep`, whose jobs know it by its folder."""
 
     folder: Path
+    brief: bool = False
+    """Whether the jobs say failures only, as for `xrgs-train`."""
 
     @property
     def exists(self) -> bool:

@@ -165,7 +165,7 @@ class Study:
         # At the start, so that a report can be made while it runs, and after it was stopped.
         sweep_id = store.write_sweep(arguments, record(plan))
         with track.Tracker(plan[0].conf.track, store) as tracker:
-            with SweepMonitor(store.cells_folder) as monitor:
+            with SweepMonitor(store.cells_folder, brief=self._brief) as monitor:
                 plan = self._run_until_complete(plan, store, [monitor, tracker])
             plan = [_without_reference(cell) for cell in plan]
             store.write_sweep(arguments, record(plan), sweep_id)

@@ -247,3 +247,7 @@ def test_the_page_of_one_cell_works_and_has_no_tags_where_photographs_are_alike(
         for of in ("#splats canvas", "#views .stage", "#photographs")
     ]
     assert places == sorted(places)
+    scores = [float(text) for text in column(browser, "#scores-table", 3)]
+    assert len(scores) == 2
+    assert scores == sorted(scores), "worst first, as the pictures"
+    assert "Nothing of this was recorded" not in shown

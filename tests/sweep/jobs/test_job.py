@@ -8,6 +8,7 @@ import os
 import shutil
 import threading
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -213,6 +214,14 @@ def test_what_components_found_is_said(
     assert run(session, cells, cell.id) == "done"
     said = capsys.readouterr().err
     assert said.count(f"{cell.id}: formation: LR views: 0.83 px of blur across, 0.84 down") == 1
+
+
+@pytest.mark.usefixtures("requests")
+def test_a_brief_job_that_is_done_says_nothing(
+    session: SweepSession, cells: Cells, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(replace(session, brief=True), cells, cells.plan().id) == "done"
+    assert capsys.readouterr().err == ""
 
 
 def test_a_cell_whose_process_died_after_it_was_finished_is_done(

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from xrgs.capture.dataset import LoadedView
 
 from tests.training.components.conftest import renderer_of
 from xrgs.config import ComponentsConf
@@ -15,6 +14,7 @@ from xrgs.splat.gaussians import ActivatedGaussians, Gaussians
 from xrgs.splat.rendering import rasterize_parameters
 from xrgs.splat.settings import RasterSettings
 from xrgs.training.components import Component, Components, Step
+from xrgs.training.dataset import LoadedView
 
 
 class Lowered(Component):

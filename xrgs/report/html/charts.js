@@ -131,13 +131,16 @@ function startCurves() {
   const known = Object.keys(RULES).filter((name) => data.history.some((row) => row[name]?.some((value) => value)));
   fill(rule, known.filter((name) => name !== "gaussians").map((name) => [name, RULES[name]]));
   const body = document.getElementById("curves-body");
+  // A short training measures nothing on its way.
+  const measured = data.scores.filter((score) => data.curves.some((row) => row[score.name]?.some((value) => value !== null)));
+  over.parentElement.hidden = !measured.length;
   const draw = () => {
-    const scores = data.scores.filter((score) => score.name !== "ssim" || filters.metric === "SSIM");
+    const scores = measured.filter((score) => score.name !== "ssim" || filters.metric === "SSIM");
     const charts = scores.map((score) => chart(`${score.label} of the test views`, withMeans(seriesFrom(data.curves, over.value, score.name)), OVER[over.value], score.label));
     charts.push(chart("Gaussians", withMeans(seriesFrom(data.history, "step", "gaussians")), OVER.step, "Gaussians"));
     if (rule.value) charts.push(chart(RULES[rule.value], withMeans(seriesFrom(data.history, "step", rule.value)), OVER.step, "so far"));
     body.replaceChildren(...charts);
-    const used = labels.filter((label) => passes({ label, scene: filters.scene }));
+    const used = data.alone && labels.length < 2 ? [] : labels.filter((label) => passes({ label, scene: filters.scene }));
     document.getElementById("curves-legend").replaceChildren(...legend(used));
   };
   over.addEventListener("change", draw);

@@ -12,7 +12,6 @@ from xrgs.errors import StoreError
 from xrgs.evaluation.metrics import METRICS, VIEW_METRICS
 from xrgs.report.collect import CURVE_COLUMNS, number_columns
 from xrgs.report.markup import titled
-from xrgs.report.photographs import alike
 from xrgs.report.writing import by_key, number, verdict, with_unit
 from xrgs.safeio.sanitize import MAX_CELL, counted, for_line
 
@@ -259,13 +258,14 @@ def page_context(
     """
     cells = comparison.cells
     done = cells[cells["cell_id"].isin(sweep.done)].drop_duplicates("cell_id")
-    replicates = done.drop_duplicates(["variant_seed", "seed"])
-    rows = [
+    replicates, planned = done.drop_duplicates(["variant_seed", "seed"]), cells["cell_id"].nunique()
+    of_many = [
         ("Compared with", shown(comparison.base) if comparison.groups else ""),
         ("Scenes", ", ".join(map(shown, comparison.scenes))),
         ("Replicates (variant.seed/seed)", _listed(_replicates(replicates))),
-        ("Cells", f"{len(done)} of {cells['cell_id'].nunique()} are done"),
+        ("Cells", f"{len(done)} of {planned} are done"),
     ]
+    rows = of_many if planned > 1 else []
     for condition, of in contexts.items():
         rows.append((shown(titled("Training and scores", condition)), of.of_scores))
         rows.append((shown(titled("Times", condition)), of.of_times))
@@ -295,7 +295,7 @@ def _views(
             continue
         train = [v for v in variant.views if v.split == "train"]
         by_kind = {"training": train}
-        if not alike(sweep.variants[variant_id]):
+        if not sweep.variants[variant_id].alike:
             by_kind = {tag: [v for v in train if v.tag == tag] for tag in ("HR", "LR")}
         by_kind["test"] = [v for v in variant.views if v.split == "test"]
         sizes = {

@@ -32,7 +32,7 @@ from xrgs.report.html.content import (
 from xrgs.report.html.images import ERROR_RANGE, add_trained, add_views
 from xrgs.report.markup import filled, filled_places, titled, to_latex, to_markdown
 from xrgs.report.paper import counterparts
-from xrgs.report.photographs import alike, photographs, placement
+from xrgs.report.photographs import photographs, placement
 from xrgs.report.writing import NO_INTERVAL, number, signed, with_unit
 from xrgs.runtime.text import TextTable, listed
 from xrgs.safeio.atomic import write_text
@@ -105,7 +105,7 @@ def write_document(
         "warnings": [shown(text) for text in (*warnings, *tables.cautions)],
     }
     content.alone = alone
-    content.mixed = not all(map(alike, sweep.variants.values()))
+    content.mixed = not all(report.alike for report in sweep.variants.values())
     write_text(file, _fitting(head, content, tables, [table for table in texts if table.rows]))
 
 

@@ -203,7 +203,8 @@ function startTraining() {
 function startScores(viewer) {
   const table = document.getElementById("scores-table");
   if (!table) return;
-  const names = data.alone ? ["Scene", "View"] : ["Scene", "View", "Arm"];
+  const ofRun = !data.alone || distinct(data.views.map(runName)).length > 1;
+  const names = [...(ofRun ? ["Scene"] : []), "View", ...(data.alone ? [] : ["Arm"])];
   const head = element("tr", {}, ...names.map((text) => element("th", {}, text)), ...data.scores.map((score) => element("th", { class: "number" }, score.label)));
   table.tHead.append(head);
   const rows = data.views.flatMap((entry, place) => entry.arms.map((arm) => ({ entry, place, arm })));
@@ -220,13 +221,14 @@ function startScores(viewer) {
       const text = value === null ? "n/a" : value.toFixed(score.name.startsWith("psnr") ? 2 : 4);
       return element("td", { class: "number", "data-value": value ?? "" }, text);
     });
-    const row = element("tr", {}, element("td", {}, runName(entry)), element("td", {}, name), ...(data.alone ? [] : [element("td", {}, arm.label)]), ...numbers);
+    const row = element("tr", {}, ...(ofRun ? [element("td", {}, runName(entry))] : []), element("td", {}, name), ...(data.alone ? [] : [element("td", {}, arm.label)]), ...numbers);
     Object.assign(row.dataset, { scene: entry.scene, label: arm.label });
     table.tBodies[0].append(row);
   }
   makeSortable(table);
-  const first = data.scores[0];
-  sortBy(table, names.length, !first.higher);
+  // On the page of one label by what orders the views above.
+  const by = data.alone ? Math.max(0, data.scores.findIndex((score) => score.name === "psnr")) : 0;
+  sortBy(table, names.length + by, !data.scores[by].higher);
   onFilter.push(() => {
     for (const row of table.tBodies[0].rows) row.hidden = !passes(row.dataset);
   });

@@ -132,7 +132,8 @@ def _run_under_lease(
         _check_code(name, cell.id, conf, identity)
         if not begin_attempt(cell, held.beat):
             return _lost(cell)
-        log_line(f"{name}: training cell {cell.id}")
+        if not session.brief:
+            log_line(f"{name}: training cell {cell.id}")
         return _train_in_child(cell, conf, store, variant, held, session)
     finally:
         held.release()
@@ -195,7 +196,7 @@ def _train_in_child(
         return error.outcome
     except XrgsError as error:
         return _after_error(error, store, cell, held)
-    for line in answer["found"]:
+    for line in () if session.brief else answer["found"]:
         log_line(f"{cell.id}: {line}")
     return cell.state().name
 
