@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from xrgs.capture import images
 from xrgs.capture.lens import Lens, lens_of_model
 from xrgs.capture.masks import MASKS
-from xrgs.capture.own_cameras import other_cameras
+from xrgs.capture.own_cameras import other_cameras, reprojection_error
 from xrgs.runtime.machine import usable_cores
 from xrgs.runtime.progress import ProgressBar
 from xrgs.runtime.signals import handlers_kept
@@ -422,7 +422,7 @@ def to_numpy(model: Any, index: Mapping[str, int], report: Mapping[str, Any]) ->
     points, colors = points_of(model)
     results: dict[str, Any] = {"registered": len(viewmats), "points": len(points)}
     if model.compute_num_observations():  # a model of another program may have none
-        results["reprojection_error_px"] = float(model.compute_mean_reprojection_error())
+        results["reprojection_error_px"] = reprojection_error(model)
     return Reconstruction(lenses, viewmats, points, colors, observed, {**report, **results})
 
 

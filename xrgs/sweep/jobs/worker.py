@@ -25,7 +25,7 @@ from xrgs.errors import UnreadableError, XrgsError
 from xrgs.experiment.cell_folder import LOG
 from xrgs.runtime import processes
 from xrgs.runtime.machine import set_portable_blas
-from xrgs.runtime.signals import StopRequest, StopSignal, end_by_sigterm, handlers_kept
+from xrgs.runtime.signals import StopRequest, StopSignal, end_by_sigterm
 from xrgs.runtime.streams import guard_streams, log_to_stderr, say
 from xrgs.safeio.atomic import write_json
 from xrgs.safeio.records import read_struct
@@ -171,8 +171,7 @@ def _death(code: int) -> WorkerError:
 
 
 def _build_variant(request: Mapping[str, Any]) -> dict[str, Any]:
-    with handlers_kept():  # of all modules that import pycolmap, not of `sfm` alone
-        from xrgs.capture import sfm, variant  # noqa: F401
+    from xrgs.capture import variant
     from xrgs.composing import from_dict
     from xrgs.experiment.store import Store
 
