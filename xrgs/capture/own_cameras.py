@@ -60,8 +60,8 @@ def other_cameras(model: Any, cameras: Mapping[str, tuple[int, str]]) -> dict[in
 def reprojection_error(model: Any) -> float:
     """Project the points of pycolmap's `Reconstruction`, and return their mean error, px.
 
-    Without the update, `compute_mean_reprojection_error` averages the errors that the model stores, which may be
-    from before its last change.
+    Without the update, `compute_mean_reprojection_error` averages the errors that the model stores,
+    which may be from before its last change.
     """
     model.update_point_3d_errors()
     return float(model.compute_mean_reprojection_error())
