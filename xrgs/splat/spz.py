@@ -133,7 +133,7 @@ def _warn_of_clipped(
                 path,
                 name,
                 count,
-                len(beyond),
+                len(values),
             )
 
 
