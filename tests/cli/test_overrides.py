@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -298,6 +299,8 @@ def test_an_error_of_hydra_is_one_line_with_a_hint(kind: type[Exception]) -> Non
         (["plus"], "plus: an ablation is given as +ablation=plus"),
         (["fern"], "fern: a scene is given as scene=llff/fern"),
         (["nothing"], "nothing: write KEY=VALUE"),
+        (["=5"], "=5: write KEY=VALUE"),
+        (["+=5"], "+=5: write KEY=VALUE"),
         (["--seed", "3"], "--seed: there is no such option; write seed=3"),
         (["--store=s"], "--store=s: there is no such option; write store=s"),
         (["--fail-fast"], "--fail-fast: there is no such option; write fail_fast=true"),
@@ -320,6 +323,58 @@ def test_a_typo_is_one_line_with_what_was_meant(
     assert message in err
     assert "HYDRA_FULL_ERROR" not in err
     assert len(err.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("word", "meant"),
+    [
+        ("train.steps=100,", "train.steps=100"),
+        ("train.steps=,100", "train.steps=100"),
+        ("train.steps=100,,200", "train.steps=100,200"),
+        ("seed=range(0,3,)", "'seed=range(0,3)'"),
+        ("+ablation=[a,,b]", "'+ablation=[a,b]'"),
+        ("train.steps==100", "train.steps=100"),
+        ("train.steps=choice(100", "'train.steps=choice(100)'"),
+        ("seed=sort(range(3)", "'seed=sort(range(3))'"),
+        ("variant.sfm.poses=[0,1", "'variant.sfm.poses=[0,1]'"),
+        ("components.consistency={weight:0.3", "'components.consistency={weight:0.3}'"),
+        ("train.steps=(100,200)", "train.steps=100,200"),
+        ("train.steps=choice(range(100,300,100))", "'train.steps=range(100,300,100)'"),
+        ("seed=sort(choice(range(3)))", "'seed=sort(range(3))'"),
+        ("seed=choice(choice(1,2))", "'seed=choice(1,2)'"),
+    ],
+)
+def test_an_override_that_hydra_s_grammar_refuses_is_answered_with_the_words_to_type(
+    word: str, meant: str
+) -> None:
+    with pytest.raises(XrgsError) as refused, explained():
+        expand([word])
+    assert str(refused.value).startswith(f"{word}: ")
+    assert str(refused.value).endswith(f"; write {meant}")
+    assert expand(shlex.split(meant))
+
+
+@pytest.mark.parametrize(
+    ("word", "said"),
+    [
+        ("train.steps=100;200", "several values are written as train.steps=1,2,3 or"),
+        ("seed=foo(1,2)", "can't be read"),
+        ("seed=range(a,b)", "can't be read"),
+        ("seed=range(1,2,3,4)", "can't be read"),
+        ("scene.name='a", "can't be read"),
+        ("seed=a)", "can't be read"),
+        ("train.steps=range(100,30000)", "this range has 29900 values, 10000 can be: give a step"),
+        ("seed=range(0,1,1e-9)", "this range has 1000000000 values"),
+        ("seed=range(0,-1e9,-1)", "this range has 1000000000 values"),
+        ("seed=range(0,3,0)", "the step of a range must not be 0"),
+        ("seed=choice()", "empty choice is not legal"),
+    ],
+)
+def test_no_message_has_the_words_of_a_parser(word: str, said: str) -> None:
+    with pytest.raises(XrgsError, match=re.escape(said)) as refused, explained():
+        expand([word])
+    assert str(refused.value).startswith(f"{word}: ")
+    assert not re.search("expecting|viable|argument|Exception|Error|Sweep", str(refused.value))
 
 
 def test_a_sweep_with_nothing_says_what_to_type(sweep_here: RunCommand, tmp_path: Path) -> None:

@@ -242,6 +242,9 @@ def test_a_matrix_is_by_column(file: Path) -> None:
     read = read_glb(rewritten(file, change)).gaussians
     wanted = make(4).means + torch.tensor([-1.0, -2, 3])
     torch.testing.assert_close(read.means, wanted, atol=1e-6, rtol=0)
+    matrix = matrix.T
+    with pytest.raises(XrgsError, match="the transform of its node must have 0, 0, 0, 1 as its"):
+        read_glb(rewritten(file, change))
 
 
 def primitive(description: Any) -> Any:

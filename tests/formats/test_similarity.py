@@ -75,3 +75,8 @@ def test_what_is_no_similarity_is_refused(linear: NDArray[np.float64], message: 
     matrix[:3, :3] = linear
     with pytest.raises(ValueError, match=re.escape(message)):
         transformed(make(3), matrix)
+
+
+def test_a_transposed_similarity_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"0, 0, 0, 1 as its last row; is it transposed\?"):
+        transformed(make(3), similarity(2.0).T)

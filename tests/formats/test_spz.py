@@ -86,6 +86,29 @@ def test_coordinates_of_any_size(file: Path, largest: float) -> None:
         torch.testing.assert_close(got, gaussians.means, atol=max(largest * 2**-22, 2**-24), rtol=0)
 
 
+def test_gaussians_beyond_the_format_are_counted(
+    file: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    gaussians = scene(9, degree=1)
+    write_spz(file, gaussians)
+    assert not caplog.messages
+    with torch.no_grad():
+        gaussians.sh0[:3] = torch.tensor([3.4, -3.4, 0.0])
+        gaussians.sh0[3] = 3.3
+        gaussians.scales[:2, 1] = 6.1
+        gaussians.scales[2] = -torch.inf
+        gaussians.shN[:4, 2, 0] = -1.1
+        gaussians.means[8, 2] = 1e9
+    write_spz(file, gaussians)
+    counts = {"coordinates": 1, "colours": 3, "scales": 3, "harmonics": 4}
+    for message, (name, count) in zip(caplog.messages, counts.items(), strict=True):
+        assert f"a.spz: the {name} of {count} of 9 Gaussians are beyond what .spz holds" in message
+    read = read_spz(file).gaussians
+    torch.testing.assert_close(
+        read.sh0[:3, 0], torch.tensor([[10 / 3, -10 / 3, 0]] * 3), atol=0.02, rtol=0
+    )
+
+
 @pytest.mark.parametrize("version", [3, 4])
 def test_another_programs_files_are_read(version: int) -> None:
     read = read_spz(FILES / f"splat_transform_{version}.spz")

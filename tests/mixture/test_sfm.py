@@ -210,3 +210,31 @@ def test_an_image_whose_camera_came_out_impossible_is_left_out_alone(
     assert note.startswith("not placed, because SfM made an impossible camera: IMG_2 (-29911")
     given = replace(inputs[2], K=np.eye(3))
     assert sfm.bogus_cameras(model, [given]) == {}, "known intrinsics are not judged"
+
+
+@pytest.mark.parametrize("read_back", [False, True])
+def test_the_reprojection_error_is_projected_and_not_the_stored_one(
+    tmp_path: Path, read_back: bool
+) -> None:
+    pycolmap.set_random_seed(0)
+    model = pycolmap.synthesize_dataset(pycolmap.SyntheticDatasetOptions())
+    for camera in model.cameras.values():
+        params = camera.params
+        params[0] *= 1.1  # the focal length
+        camera.params = params
+    if read_back:
+        model.write_binary(tmp_path)
+        model = pycolmap.Reconstruction(tmp_path)
+    assert model.compute_mean_reprojection_error() < 1e-6
+    errors = []
+    for point in model.points3D.values():
+        off = []
+        for seen in point.track.elements:
+            view = model.images[seen.image_id]
+            place = view.cam_from_world() * point.xyz
+            pixel = model.cameras[view.camera_id].img_from_cam(place[None])[0]
+            off.append(np.linalg.norm(pixel - view.points2D[seen.point2D_idx].xy))
+        errors.append(np.mean(off))
+    report = sfm.to_numpy(model, {}, {}).report
+    assert report["reprojection_error_px"] == pytest.approx(np.mean(errors), rel=1e-9)
+    assert report["reprojection_error_px"] > 5

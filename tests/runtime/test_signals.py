@@ -62,16 +62,22 @@ def test_colmap_leaves_the_handlers_of_signals_as_they_were() -> None:
 import faulthandler, os, signal, threading
 faulthandler.enable()
 def imported():
-    from xrgs.runtime.signals import handlers_kept
-    with handlers_kept():  # as where a variant is built
-        from xrgs.mixture import sfm
+    {imports}
 threading.Thread(target=imported).start() if {thread} else imported()
 [thread.join() for thread in threading.enumerate() if thread is not threading.current_thread()]
 os.kill(os.getpid(), signal.{name})
 """
-    for name, thread, said in (("SIGTERM", 0, ""), ("SIGTERM", 1, ""), ("SIGABRT", 0, "Fatal Py")):
+    distorted = "Lens('SIMPLE_RADIAL', (9, 4, 3, 0.1), 8, 6)"
+    for imports, name, thread, said in (
+        ("from xrgs.mixture import sfm", "SIGTERM", 0, ""),
+        ("from xrgs.mixture import sfm", "SIGTERM", 1, ""),
+        ("from xrgs.mixture import sfm", "SIGABRT", 0, "Fatal Py"),
+        ("from xrgs.mixture import colmap", "SIGTERM", 0, ""),
+        ("from xrgs.mixture import own_cameras", "SIGTERM", 0, ""),
+        (f"from xrgs.photos.lens import Lens; {distorted}.kept()", "SIGTERM", 0, ""),
+    ):
         done = subprocess.run(
-            [sys.executable, "-P", "-c", script.format(name=name, thread=thread)],
+            [sys.executable, "-P", "-c", script.format(imports=imports, name=name, thread=thread)],
             capture_output=True,
             text=True,
             check=False,

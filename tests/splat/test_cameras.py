@@ -9,6 +9,20 @@ from tests.splat.scenes import make_camera
 from xrgs.splat.cameras import Camera
 
 
+def moved() -> torch.Tensor:
+    """A viewmat [4, 4] with a translation."""
+    viewmat = torch.eye(4)
+    viewmat[2, 3] = 3
+    return viewmat
+
+
+def test_an_inverse_of_float32_is_a_viewmat() -> None:
+    camera = make_camera(turned=True)
+    viewmat = camera.viewmat.float()
+    viewmat[:3, 3] = torch.tensor([300.0, -2000.0, 70.0])
+    Camera(torch.linalg.inv(torch.linalg.inv(viewmat)), camera.K.float(), 9, 9)
+
+
 def test_the_position_has_camera_coordinates_of_zero() -> None:
     camera = make_camera(turned=True)
     seen = camera.viewmat[:3, :3] @ camera.position + camera.viewmat[:3, 3]
@@ -28,6 +42,11 @@ def test_the_position_has_camera_coordinates_of_zero() -> None:
         ("K", torch.tensor([[1.0, 0.1, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), "skew"),
         ("viewmat", torch.diag(torch.tensor([2.0, 2.0, 2.0, 1.0])), "without scale"),
         ("viewmat", torch.diag(torch.tensor([-1.0, 1.0, 1.0, 1.0])), "rotation"),
+        ("viewmat", torch.diag(torch.tensor([1.0, 1.0, 1.0, 2.0])), "the last row of viewmat"),
+        ("viewmat", moved().T, r"the last row of viewmat .*\[0.0, 0.0, 3.0, 1.0\]; is it trans"),
+        ("viewmat", moved().double().T, "the last row of viewmat"),
+        ("K", torch.tensor([[40.0, 0, 0], [0, 40, 0], [24, 16, 1]]), "the last row of K"),
+        ("K", torch.diag(torch.tensor([40.0, 40.0, 2.0])), "the last row of K"),
     ],
 )
 def test_bad_input_is_named(field: str, value: Any, message: str) -> None:

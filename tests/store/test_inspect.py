@@ -201,7 +201,7 @@ def test_photographs_as_they_are_are_described_without_a_split(
         "max_num_features": 9,
         "hr": ["a"],
         "lr": ["b-low"],
-        "sampling_rate": {"HR": [1, 1, 1], "LR": [0.9, 0.9, 0.9]},
+        "rho": {"HR": [1, 1, 1], "LR": [0.9, 0.9, 0.9]},
         "lr_blur": 0.3,
         "notes": notes,
     }
@@ -394,7 +394,7 @@ def test_only_so_many_views_are_drawn(mixed: Variant, monkeypatch: pytest.Monkey
 
 @pytest.mark.parametrize(
     ("wrong", "field"),
-    [({"lr": 5}, "lr"), ({"sampling_rate": {"HR": ["a"]}}, "rho"), ({"attempts": [1]}, r"attempts\[0\]")],
+    [({"lr": 5}, "lr"), ({"rho": {"HR": ["a"]}}, "rho"), ({"attempts": [1]}, r"attempts\[0\]")],
 )
 def test_a_damaged_report_is_named_with_its_field(
     tmp_path: Path, wrong: dict[str, Any], field: str

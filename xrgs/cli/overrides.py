@@ -40,6 +40,13 @@ _QUOTED, _QUOTED_PART = (
 )
 #: By how much a bracket changes the depth of what is behind it.
 _DEPTH = dict.fromkeys("([{", 1) | dict.fromkeys(")]}", -1)
+_CLOSES = {"(": ")", "[": "]", "{": "}"}
+#: A comma at an end of a list, or behind another one.
+_LONE_COMMA = re.compile(r"^[\s,]+|(?<=[(\[{,])[\s,]+|[\s,]+(?=[)\]}]|$)")
+#: How Hydra says that a function of an override fails.
+_CALL = re.compile(
+    r"(?P<kind>\w+) while evaluating '(?P<call>(?P<name>\w+)\((?P<inside>.*?)\))': (?P<reason>.*)"
+)
 #: The key or the resolver of an interpolation.
 _INTERPOLATED = re.compile(r"\$\{([^:}]*)")
 #: Options of Hydra; those of the second set have a value.
@@ -105,9 +112,7 @@ def _explained(error: Exception) -> str:
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         return _missing_file(error.missing_cfg_file, error.options or ())
     if isinstance(error, OverrideParseException):
-        first, second, *_ = *str(error).splitlines(), ""
-        cause = second if first.startswith("Error parsing override") else first
-        return f"{error.override}: {cause}"
+        return _malformed(str(error.override), str(error))
     if found := _IN_FILE.match(str(error)):
         return _wrong_file(found[1], error.__context__ or error)
     if found := _NOT_OVERRIDDEN.search(str(error)):
@@ -121,6 +126,41 @@ def _explained(error: Exception) -> str:
     elif isinstance(error.__cause__, OmegaConfBaseException):  # it names the key and the value
         return _explained(error.__cause__)
     return composing.error_line(error) + offered
+
+
+def _malformed(word: str, said: str) -> str:
+    """Return what to type in place of a word that Hydra's grammar refuses, and says so."""
+    key, _, value = word.partition("=")
+    call = _CALL.search(said)
+    whole, name, inside = call.group("call", "name", "inside") if call else ("", "", "")
+    axis = inside if inside.endswith(")") else whole
+    candidates = (
+        ("a comma has no value beside it", _LONE_COMMA.sub("", value)),
+        ("there is one = too many", value.lstrip("=")),
+        ("a bracket is not closed", value + _closing(value)),
+        ("axes are not in brackets", value[1:-1] if value[:1] + value[-1:] == "()" else value),
+        (f"{name}(...) takes values, and no axis", value.replace(whole, axis)),
+    )
+    for why, meant in candidates:
+        if meant != value and _parsed(f"{key}={meant}"):
+            return f"{word}: {why}; write {shlex.quote(f'{key}={meant}')}"
+    if call and call["kind"] == "ValueError":
+        return f"{word}: {call['reason']}"
+    return (
+        f"{word}: can't be read; several values are written as {key}=1,2,3 or {key}=range(1,4), and"
+        f" a text with brackets, quotes or other signs in quotes, {key}='a (b)'"
+    )
+
+
+def _closing(text: str) -> str:
+    """Return the brackets that close those that are open at the end of a text."""
+    still_open: list[str] = []
+    for sign in _QUOTED.sub("", text):
+        if sign in _CLOSES:
+            still_open.append(_CLOSES[sign])
+        elif still_open and sign == still_open[-1]:
+            still_open.pop()
+    return "".join(reversed(still_open))
 
 
 def _wrong_file(file: str, error: BaseException) -> str:
@@ -340,7 +380,7 @@ def check_words(words: Sequence[str]) -> None:
             raise XrgsError(f"{word}: there is no such option; write {shlex.quote(meant)}")
         if is_option:
             raise XrgsError(f"{word}: there is no such option; see xrgs-sweep --help")
-        if not is_assignment and word[:1] not in {"-", "~"}:
+        if (not is_assignment and word[:1] not in {"-", "~"}) or not key.lstrip("+~"):
             raise XrgsError(_meant(word, before))
         before = word
 

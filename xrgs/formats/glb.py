@@ -241,7 +241,10 @@ def _read(path: Path, content: bytes) -> SavedGaussians:
         world = _to_world(description["nodes"], node)
         turn = Rotation.from_quat(own[_TURNED_BY]).as_matrix() if _TURNED_BY in own else _DOWN_TO_UP
         world[:3] = turn.T @ world[:3]
-        gaussians = transformed(gaussians, world)
+        try:
+            gaussians = transformed(gaussians, world)
+        except ValueError as error:
+            raise ValueError(f"the transform of its node {error}") from error
     return SavedGaussians(gaussians, bool(extension.get("extras", {}).get("antialiased")))
 
 

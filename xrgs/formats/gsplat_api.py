@@ -336,9 +336,6 @@ def _cameras(viewmats: Tensor, Ks: Tensor, width: int, height: int) -> list[Came
     for index, (viewmat, K) in enumerate(zip(viewmats.detach(), Ks.detach(), strict=True)):
         try:
             cameras.append(Camera(viewmat, K, width, height))
-            for name, matrix in (("viewmat", viewmat), ("K", K)):
-                if (matrix[-1] - torch.eye(len(matrix))[-1]).abs().max() > 1e-5:  # an inverse's
-                    raise ValueError(f"the last row of {name} must be 0, ..., 0, 1")
         except ValueError as error:
             raise ValueError(f"viewmats, Ks, camera {index}: {error}") from error
     return cameras

@@ -38,6 +38,8 @@ def transformed(gaussians: Gaussians, similarity: NDArray[np.float64]) -> Gaussi
     determinant = float(np.linalg.det(linear)) if np.isfinite(similarity).all() else 0.0
     if determinant == 0:
         raise ValueError("must be finite, a rotation times a scale above 0")
+    if not np.allclose(similarity[3], [0, 0, 0, 1], rtol=0, atol=_TOLERANCE):
+        raise ValueError("must have 0, 0, 0, 1 as its last row; is it transposed?")
     scale = np.cbrt(abs(determinant))
     rotation = linear / scale
     if not np.allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=_TOLERANCE):

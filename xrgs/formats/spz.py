@@ -36,7 +36,7 @@ from xrgs.splat.gaussians import PARAMETERS
 from xrgs.splat.sh import MAX_DEGREE, bases
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -67,8 +67,9 @@ _MOST_AXES = 16
 def write_spz(path: Path, gaussians: Gaussians, *, antialiased: bool = False) -> None:
     """Write Gaussians to a .spz file of version 3, which is replaced atomically.
 
-    What the format can't hold is set to the nearest value that it can: scales outside e^-10 to
-    e^5.9, coefficients of bands above 0 outside -1..1, coordinates beyond 8 million. Nothing is
+    What the format can't hold is set to the nearest value that it can, and a warning counts these
+    Gaussians: scales outside e^-10 to e^5.9, colours whose coefficient of band 0 is outside
+    -3.3..3.3, coefficients of bands above 0 outside -1..1, coordinates beyond 8 million. Nothing is
     turned: the file has the axes of the Gaussians' world.
 
     Args:
@@ -87,25 +88,53 @@ def write_spz(path: Path, gaussians: Gaussians, *, antialiased: bool = False) ->
     )
     quats = unit_quaternions(gaussians.quats)
     alpha = gaussians.opacities.detach().double().sigmoid().numpy()
-    scales = scales.clip(*_LOG_SCALES)
-    values = (means, quats, scales, alpha, sh0, shN)
+    values = (means, quats, scales.clip(*_LOG_SCALES), alpha, sh0, shN)
     check_arrays_finite(path, dict(zip(PARAMETERS, values, strict=True)))
     degree = round((shN.shape[1] + 1) ** 0.5) - 1
     bits = _fraction_bits(float(np.abs(means).max(initial=0)))
     flags = _ANTIALIASED if antialiased else 0
     limit = 2**_MAX_FRACTION - 1
-    fixed = (means * 2.0**bits).round().clip(-limit, limit).astype("<i4")
+    fixed = (means * 2.0**bits).round()
+    stored = {
+        "colours": (sh0 * _COLOR_SCALE + 0.5) * 255,
+        "scales": (scales + 10) * 16,
+        "harmonics": shN * 128 + 128,
+    }
+    _warn_of_clipped(
+        path,
+        {"coordinates": (fixed, -limit, limit)}
+        | {name: (of, -1, 256) for name, of in stored.items()},
+    )
+    colors, log_scales, harmonics = (_to_bytes(of).tobytes() for of in stored.values())
     content = [
         _HEADER.pack(_MAGIC, 3, len(means), degree, bits, flags, 0),
-        fixed.view(np.uint8).reshape(-1, 4)[:, :3].tobytes(),
+        fixed.clip(-limit, limit).astype("<i4").view(np.uint8).reshape(-1, 4)[:, :3].tobytes(),
         _to_bytes(alpha * 255).tobytes(),
-        _to_bytes((sh0 * _COLOR_SCALE + 0.5) * 255).tobytes(),
-        _to_bytes((scales + 10) * 16).tobytes(),
+        colors,
+        log_scales,
         _packed_quaternions(quats).tobytes(),
-        _to_bytes(shN * 128 + 128).tobytes(),
+        harmonics,
     ]
     with atomic_writer(path) as file:
         file.write(gzip.compress(b"".join(content), compresslevel=6, mtime=0))
+
+
+def _warn_of_clipped(
+    path: Path, stored: Mapping[str, tuple[NDArray[np.float64], float, float]]
+) -> None:
+    """Count the Gaussians [N, ...] of which a value is beyond a least and a largest one."""
+    for name, (values, least, most) in stored.items():
+        axes = tuple(range(1, values.ndim))
+        beyond = ((values < least) | (values > most)).any(axis=axes)
+        if count := beyond.sum():
+            _log.warning(
+                "%s: the %s of %d of %d Gaussians are beyond what .spz holds, and are set to the"
+                " nearest values that it does; .ply holds all",
+                path,
+                name,
+                count,
+                len(values),
+            )
 
 
 def _fraction_bits(largest: float) -> int:

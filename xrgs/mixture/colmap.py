@@ -8,11 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 from xrgs.errors import XrgsError
+from xrgs.runtime.signals import handlers_kept
 from xrgs.safeio import ply
+
+with handlers_kept():
+    import pycolmap
 
 #: The colour of points without one.
 GREY = 128

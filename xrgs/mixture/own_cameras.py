@@ -7,7 +7,10 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
-import pycolmap
+from xrgs.runtime.signals import handlers_kept
+
+with handlers_kept():
+    import pycolmap
 
 #: Where images with one camera are tried with cameras of their own: the fewest images, the most
 #: iterations, the share of the reprojection error that must remain at most, and the ratio of focal
@@ -24,7 +27,8 @@ def other_cameras(model: Any, cameras: Mapping[str, tuple[int, str]]) -> dict[in
     then 5 % from those of the others with their camera.
 
     Args:
-        model: pycolmap's `Reconstruction`; it stays as it is.
+        model: pycolmap's `Reconstruction`; it stays as it is, but for the errors
+            that it stores with its points.
         cameras: The index of each image and the name of its camera, by the image's name in the
             model; images with one name share the camera. Others are left alone.
 
@@ -36,10 +40,7 @@ def other_cameras(model: Any, cameras: Mapping[str, tuple[int, str]]) -> dict[in
     if not any(image.has_pose and image.name in shared for image in model.images.values()):
         return {}
     own = _with_own_cameras(model)
-    if (
-        not own.compute_mean_reprojection_error()
-        < _BETTER * model.compute_mean_reprojection_error()
-    ):
+    if not reprojection_error(own) < _BETTER * reprojection_error(model):
         return {}
     focals: dict[str, dict[int, float]] = {}
     for image in own.images.values():
@@ -54,6 +55,16 @@ def other_cameras(model: Any, cameras: Mapping[str, tuple[int, str]]) -> dict[in
         for number, group in enumerate((g for g in groups if g is not usual), len(apart) + 1):
             apart |= dict.fromkeys(group, number)
     return apart
+
+
+def reprojection_error(model: Any) -> float:
+    """Project the points of pycolmap's `Reconstruction`, and return their mean error, px.
+
+    Without the update, `compute_mean_reprojection_error` averages the errors that the model stores,
+    which may be from before its last change.
+    """
+    model.update_point_3d_errors()
+    return float(model.compute_mean_reprojection_error())
 
 
 def groups_of_focals(focals: Mapping[int, float]) -> list[list[int]]:
@@ -92,5 +103,4 @@ def _with_own_cameras(model: Any) -> Any:
         config.add_image(number)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     pycolmap.create_default_bundle_adjuster(options, config, own).solve()
-    own.update_point_3d_errors()
     return own

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from xrgs.mixture.own_cameras import other_cameras
+from xrgs.mixture.own_cameras import other_cameras, reprojection_error
 from xrgs.photos import images
 from xrgs.photos.lens import Lens, lens_of_model
 from xrgs.photos.masks import MASKS
@@ -422,7 +422,7 @@ def to_numpy(model: Any, index: Mapping[str, int], report: Mapping[str, Any]) ->
     points, colors = points_of(model)
     results: dict[str, Any] = {"registered": len(viewmats), "points": len(points)}
     if model.compute_num_observations():  # a model of another program may have none
-        results["reprojection_error_px"] = float(model.compute_mean_reprojection_error())
+        results["reprojection_error_px"] = reprojection_error(model)
     return Reconstruction(lenses, viewmats, points, colors, observed, {**report, **results})
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from xrgs.errors import XrgsError
+from xrgs.runtime.signals import handlers_kept
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -148,7 +149,8 @@ class Lens:
         """
         import zlib  # noqa: F401  pycolmap 4.2.1 corrupts the heap where it is imported before zlib
 
-        import pycolmap
+        with handlers_kept():
+            import pycolmap
 
         camera = pycolmap.Camera(model=self.model, width=1, height=1, params=self.params)
         linear, shift = self._affine()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 import resource
-import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -134,12 +133,9 @@ def gpus() -> list[str]:
     if visible is not None:
         names = [name.strip() for name in visible.split(",")]
         return [name for name in names if name not in {"", "-1", "NoDevFiles"}]
-    command = ["nvidia-smi", "--query-gpu=uuid", "--format=csv,noheader"]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, check=True)  # noqa: S603
-    except (OSError, subprocess.CalledProcessError):  # not installed, or without a driver
-        return []
-    return done.stdout.split()
+    import torch
+
+    return [str(number) for number in range(torch.cuda.device_count())]
 
 
 @contextmanager

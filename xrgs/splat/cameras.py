@@ -14,6 +14,8 @@ from torch import Tensor
 ORTHONORMAL_TOLERANCE = 1e-3
 """Largest entry of R R^T - I for the rotation R of a viewmat. The float32 exports of SfM are at
 1e-6; a matrix with a scale is far above."""
+LAST_ROW_TOLERANCE = 1e-5
+"""How far the last row of a viewmat or of K may be from 0, ..., 0, 1: inverses are rounded."""
 
 
 class CameraNumbers(NamedTuple):
@@ -41,8 +43,8 @@ class Camera:
 
     Raises:
         ValueError: A matrix has the wrong shape or values that are not finite, `viewmat` is not
-            rigid, `K` has skew or a focal length that is not above 0, or the image has no pixel.
-            The message names the field.
+            rigid, `K` has skew or a focal length that is not above 0, the last row of either is not
+            0, ..., 0, 1, or the image has no pixel. The message names the field.
 
     Examples:
         >>> K = torch.tensor([[40.0, 0.0, 24.0], [0.0, 40.0, 16.0], [0.0, 0.0, 1.0]])
@@ -72,6 +74,13 @@ class Camera:
         error = rotation @ rotation.T - torch.eye(3, dtype=rotation.dtype)
         if error.abs().max() > ORTHONORMAL_TOLERANCE or torch.linalg.det(rotation) < 0:
             raise ValueError("viewmat must be a rotation and a translation, without scale")
+        for name, matrix in (("viewmat", self.viewmat), ("K", self.K)):
+            row = matrix[-1]
+            if (row - torch.eye(len(row), dtype=row.dtype)[-1]).abs().max() > LAST_ROW_TOLERANCE:
+                raise ValueError(
+                    f"the last row of {name} must be 0, ..., 0, 1, got {row.tolist()}; is it"
+                    " transposed?"
+                )
 
     @property
     def position(self) -> Tensor:

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from hydra.core.config_loader import ConfigLoader
     from hydra.core.override_parser.types import Override
 
+#: The most values of a range; without its step, a range of training steps has many more.
+_MOST_VALUES = 10_000
 _CASTS = ("int", "float", "str", "bool")
 
 
@@ -61,11 +63,13 @@ def _range(start: float, stop: float | None = None, step: float = 1) -> ChoiceSw
         start, stop = 0, start
     if step == 0:
         raise ValueError("the step of a range must not be 0")
-    if isinstance(start, int) and isinstance(stop, int) and isinstance(step, int):
-        return ChoiceSweep(list=[*range(start, stop, step)])
     numbers = (start, stop, step)
     if not all(map(math.isfinite, numbers)):
         raise ValueError("the numbers of a range must be finite")
+    if (count := (stop - start) / step) > _MOST_VALUES:
+        raise ValueError(f"this range has {count:.0f} values, {_MOST_VALUES} can be: give a step")
+    if isinstance(start, int) and isinstance(stop, int) and isinstance(step, int):
+        return ChoiceSweep(list=[*range(start, stop, step)])
     return ChoiceSweep(list=[*map(float, _steps(*(Decimal(str(number)) for number in numbers)))])
 
 

@@ -153,7 +153,7 @@ def one_cell_a_gpu(launcher: DictConfig, allowed: Capacity, count: int) -> Capac
         return replace(allowed, settings=settings)
     if count == 0:
         raise XrgsError(
-            "splat.backend=gsplat: this machine has no GPU: nvidia-smi lists none, or"
+            "splat.backend=gsplat: this machine has no GPU: torch sees none, or"
             " CUDA_VISIBLE_DEVICES hides them"
         )
     at_once = min(allowed.at_once, count)

@@ -65,6 +65,43 @@ def test_photographs_that_are_twice_as_wide_as_high_are_kept(tmp_path: Path) -> 
     assert (len(found.files), found.notes) == (8, ())
 
 
+def changed(kind: str, seed: int) -> NDArray[np.uint8]:
+    """A panorama of all directions, as its maker left it."""
+    picture = sphere(seed)
+    if kind == "sky":
+        picture[:64] = np.linspace(220, 160, 64)[:, None, None]
+    elif kind == "black from below":
+        picture[-16:] = 0
+    elif kind == "tripod":
+        picture[-12:, 50:120] = 255
+    elif kind == "strip":
+        picture = picture[16:-16]
+    elif kind == "rolled":
+        picture = np.roll(picture, 37, 1)
+    return picture
+
+
+@pytest.mark.parametrize("kind", ["sky", "black from below", "rolled"])
+def test_a_plain_sky_or_floor_of_a_panorama_hides_it_not(tmp_path: Path, kind: str) -> None:
+    for i in range(3):
+        Image.fromarray(changed(kind, i)).save(tmp_path / f"p{i}.png")
+    with pytest.raises(XrgsError, match="left out as panoramas of 360 degrees"):
+        folder.look(str(tmp_path), 0)
+
+
+@pytest.mark.parametrize("kind", ["tripod", "strip"])
+def test_what_may_be_a_panorama_is_kept_and_named(tmp_path: Path, kind: str) -> None:
+    for i in range(3):
+        Image.fromarray(changed(kind, i)).save(tmp_path / f"p{i}.png")
+    found = folder.look(str(tmp_path), 0)
+    assert [*found.files] == ["p0", "p1", "p2"]
+    (note,) = found.notes
+    assert note == (
+        "kept, and perhaps panoramas, since their left edges go on at the right: "
+        "p0.png, p1.png, p2.png"
+    )
+
+
 @pytest.mark.parametrize("background", ["plain", "gradient", "noise"])
 def test_objects_before_a_plain_background_are_kept(tmp_path: Path, background: str) -> None:
     """It goes on at the other side, and its top and bottom rows vary little."""

@@ -20,7 +20,7 @@ from xrgs.splat.gaussians import ActivatedGaussians
 from xrgs.splat.rendering import Render, is_zero_offset
 from xrgs.splat.settings import RasterSettings
 from xrgs.splat.sh import bases
-from xrgs.splat.torch.activations import activate
+from xrgs.splat.torch.activations import activated
 
 
 def _load() -> Any:
@@ -35,21 +35,20 @@ def _load() -> Any:
             f"splat.backend=gsplat: torch {torch.__version__}, built for {built}, sees no CUDA GPU;"
             " does nvidia-smi list one? It needs torch for its CUDA (pytorch.org)"
         )
+    failure: Exception = ImportError("not compiled, and gsplat finds no CUDA compiler")
     try:
         import gsplat
         from gsplat.cuda import _backend
+
+        kernels = _backend._C
     except (ImportError, OSError, RuntimeError, subprocess.SubprocessError) as error:
-        reason = str(error).strip().partition("\n")[0]
+        kernels, failure = None, error
+    if kernels is None:
+        reason = str(failure).strip().partition("\n")[0]
         raise XrgsError(
             f"splat.backend=gsplat: gsplat's kernels can't be loaded ({reason}); to compile them"
-            " takes nvcc of torch's CUDA, a C++ compiler and ninja"
-        ) from error
-    if _backend._C is None:
-        raise XrgsError(
-            "splat.backend=gsplat: gsplat's kernels are not compiled, and there is no CUDA compiler"
-            " to do so: install the CUDA toolkit, with nvcc on the PATH or CUDA_HOME set, or a"
-            " compiled wheel of gsplat"
-        )
+            " takes nvcc of torch's CUDA, on the PATH or below CUDA_HOME, a C++ compiler and ninja"
+        ) from failure
     # Or the convolutions of the loss would keep 10 bits of each factor.
     torch.backends.cudnn.allow_tf32 = False
     return gsplat
@@ -90,12 +89,10 @@ def render(
         XrgsError: A setting differs from the constants of gsplat's kernels.
     """
     check_raster("gsplat", settings)
-    given = means2d_offset is not None and len(means2d_offset) > 0
-    if given and not is_zero_offset(means2d_offset):
+    if means2d_offset is not None and len(means2d_offset) and not is_zero_offset(means2d_offset):
         raise ValueError("means2d_offset must be of zero_means2d_offset: gsplat adds no offset")
     if raw:
-        scales, opacities = activate(gaussians.scales, gaussians.opacities)
-        gaussians = gaussians._replace(scales=scales, opacities=opacities)
+        gaussians = activated(gaussians)
     means, quats, scales, opacities, sh0, shN = gaussians
     if means2d_offset is not None:
         means = _with_gradient_of(means2d_offset, means, settings.absgrad)

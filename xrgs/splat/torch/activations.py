@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from xrgs.splat.gaussians import ActivatedGaussians
+
 
 def exp(x: Tensor) -> Tensor:
     """Return e^x: scales from their natural logarithms."""
@@ -19,3 +21,9 @@ def logistic(x: Tensor) -> Tensor:
 def activate(scales: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor]:
     """Return `exp(scales)` and `logistic(opacities)`."""
     return torch.exp(scales), torch.sigmoid(opacities)
+
+
+def activated(raw: ActivatedGaussians) -> ActivatedGaussians:
+    """Return Gaussians whose scales and opacities were natural logarithms and logits."""
+    scales, opacities = activate(raw.scales, raw.opacities)
+    return raw._replace(scales=scales, opacities=opacities)

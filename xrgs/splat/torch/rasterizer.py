@@ -21,7 +21,7 @@ from xrgs.splat.gaussians import ActivatedGaussians
 from xrgs.splat.rendering import Render
 from xrgs.splat.settings import RasterSettings
 from xrgs.splat.sh import sh_to_colors
-from xrgs.splat.torch.activations import activate
+from xrgs.splat.torch.activations import activated
 from xrgs.splat.torch.projection import (
     ProjectedGaussians,
     conic_cholesky,
@@ -68,8 +68,7 @@ def render(
         MemoryError: There are more (tile, Gaussian) pairs than fit in memory.
     """
     if raw:
-        scales, opacities = activate(gaussians.scales, gaussians.opacities)
-        gaussians = gaussians._replace(scales=scales, opacities=opacities)
+        gaussians = activated(gaussians)
     means = gaussians.means
     if means2d_offset is None:
         means2d_offset = means.new_zeros((len(means), 2))

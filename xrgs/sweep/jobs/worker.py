@@ -24,7 +24,7 @@ import msgspec
 from xrgs.errors import XrgsError
 from xrgs.runtime import processes
 from xrgs.runtime.machine import set_portable_blas
-from xrgs.runtime.signals import StopRequest, StopSignal, end_by_sigterm, handlers_kept
+from xrgs.runtime.signals import StopRequest, StopSignal, end_by_sigterm
 from xrgs.runtime.streams import guard_streams, log_to_stderr, say
 from xrgs.safeio.atomic import write_json
 from xrgs.safeio.records import read_struct
@@ -160,9 +160,8 @@ def _death(code: int) -> WorkerError:
 
 
 def _build_variant(request: Mapping[str, Any]) -> dict[str, Any]:
-    with handlers_kept():  # of all modules that import pycolmap, not of `sfm` alone
-        from xrgs.mixture import sfm, variant  # noqa: F401
     from xrgs.composing import from_dict
+    from xrgs.mixture import variant
     from xrgs.store.store import Store
 
     log_to_stderr()
