@@ -8,8 +8,8 @@ import pytest
 
 from examples.arms.tests.conftest import ARMS, with_arms
 from tests.test_ablations import cell_id
+from xrgs import plugins
 from xrgs.composing import ARMS as NAMES
-from xrgs.training import plugins
 
 POINTS = tomllib.loads((ARMS / "pyproject.toml").read_text())["project"]["entry-points"]
 

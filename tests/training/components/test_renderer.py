@@ -32,7 +32,7 @@ def test_views_are_rendered_with_all_components(
     views: dict[str, LoadedView],
 ) -> None:
     off.supersampled.factor = off.supersampled.late_factor = 2
-    fine = views["HR"], replace(views["LR"], rho=0.2)
+    fine = views["HR"], replace(views["LR"], sampling_rate=0.2)
     parts = Components([*build(off, *fine), Lowered()])
     renderer = renderer_of(parts)
     lower = shown.activated()._replace(opacities=shown.activated().opacities * 0.1)
