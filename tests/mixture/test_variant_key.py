@@ -62,6 +62,7 @@ def add_to(file: Path) -> None:
         stream.write("\nMORE = 1\n")
 
 
+@pytest.mark.slow
 def test_every_file_of_photos_and_mixture_counts_always_or_with_a_part(
     package: Path, configured: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:

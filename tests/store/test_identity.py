@@ -259,31 +259,12 @@ def test_the_renderer_of_gsplat_and_its_version_count_where_it_renders(
     assert ids_after(edit, known) == (set(confs), {"gsplat"})
 
 
-def test_every_file_of_the_model_and_of_training_counts_always_or_with_a_part(
-    package: Path, confs: dict[str, Conf], compose: Callable[..., Conf]
-) -> None:
-    """A line of code at the end of each file in turn: which ids change."""
-    every = confs | {"dense": compose("splat.init=dense"), "mcmc": compose("splat.strategy=mcmc")}
-    components = [key for key in BUILT_IN if file_of(key)]
-    before = {name: identity.cell_identity(conf, "v").code for name, conf in every.items()}
-    on_gsplat = identity.code_now("gsplat")
-    of_each = {key: identity.code_now("native", (key,))[key] for key in components}
-    uncounted = set()
-    files = {file for folder in ("splat", "training") for file in (package / folder).rglob("*.py")}
-    for file in files:
-        text = file.read_text()
-        file.write_text(f"{text}\nMORE = 1\n")
-        identity.training_code.cache_clear()
-        after = {name: identity.cell_identity(conf, "v").code for name, conf in every.items()}
-        counts = (
-            after != before
-            or identity.code_now("gsplat") != on_gsplat
-            or any(identity.code_now("native", (k,))[k] != of_each[k] for k in components)
-        )
-        if not counts:
-            uncounted.add(file.relative_to(package).as_posix())
-        file.write_text(text)
-    assert uncounted == set()
+def test_every_file_of_the_model_and_of_training_counts_always_or_with_a_part() -> None:
+    folders = identity.CODE
+    counted = {*folders.core(), *(name for part in folders.parts for name in folders.part(part))}
+    for file in code.sources(*folders.folders):
+        name = file.relative_to(PACKAGE).as_posix()
+        assert name in counted or name.startswith(folders.whole_parts), name
 
 
 @pytest.mark.parametrize(
@@ -338,7 +319,7 @@ def test_an_import_of_our_own_counts(package: Path, confs: dict[str, Conf]) -> N
 def test_a_strategy_counts_where_it_is_on(
     package: Path, confs: dict[str, Conf], compose: Callable[..., Conf]
 ) -> None:
-    both = confs | {"mcmc": compose("splat.strategy=mcmc")}
+    both = confs | {"mcmc": compose("+ablation=mcmc")}
     file = package / "splat/strategy/mcmc.py"
     edit = lambda: file.write_text(f"{file.read_text()}\nMORE = 1\n")  # noqa: E731
     assert ids_after(edit, both)[1] == {"mcmc"}

@@ -142,7 +142,8 @@ def _files(
     files: dict[str, tuple[str, ...]] = {"core": CODE.core(), **_BACKENDS[backend]}
     if init in _STARTS:
         files[init] = _STARTS[init]
-    files[f"strategy/{strategy}"] = CODE.part(f"splat/strategy/{strategy}.py")
+    if strategy in STRATEGIES:  # else the config is refused
+        files[f"strategy/{strategy}"] = CODE.part(f"splat/strategy/{strategy}.py")
     return files | {key: CODE.part(file) for key in components if (file := file_of(key))}
 
 
