@@ -137,7 +137,7 @@ def test_cells_that_differ_in_numbers_share_one_config_and_get_their_own_values(
     study: Callable[..., Study], compose: Callable[..., config.Conf]
 ) -> None:
     made = study()
-    axes = ["seed=0,1", "variant.factor=2,5", "variant.hr_fraction=0.1,0.5"]
+    axes = ["preset=laptop", "seed=0,1", "variant.factor=2,5", "variant.hr_fraction=0.1,0.5"]
     plan = made._plan([*axes, "+ablation=consistency"])
     assert len(plan) == 16
     assert [cell.conf for cell in plan] == [compose(*cell.spec.overrides) for cell in plan]
