@@ -24,6 +24,7 @@ GAUSSIANS = 60_001
 """Above 32,768, from which on torch divides a tensor among its threads; of no round number, so that
 the parts have tails."""
 _BOTH = (
+    "preset=laptop",
     "splat.backend=native",
     "splat.sh_every=6000",
     # 9 steps stand for 30,000: Gaussians are refined at steps 1 to 6, and reset at 3 and 6.
