@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from xrgs.bench.speed import Trial
 from xrgs.cli import budget, sweep, train
 from xrgs.photos.scenes import motorcycle
 from xrgs.store.cell_folder import CellFolder
@@ -32,6 +33,7 @@ def handed_over(
         monkeypatch.setattr(train, "_look", lambda _: found)
         monkeypatch.setattr(train, "_measured_unit", lambda _: 1e-7)
         monkeypatch.setattr(train, "_units_of_a_step", lambda *_: 1e5)
+        monkeypatch.setattr(train, "_tried", lambda *_: Trial(start_s=0.0, step_s=0.01))
         monkeypatch.setattr(train, "_say_end", lambda *_: None)
         monkeypatch.setattr(train, "_cell", lambda *_: CellFolder(Path("absent")))
         monkeypatch.setattr(sweep, "run", lambda _, of, __: words.extend(of))
@@ -114,7 +116,7 @@ def test_minutes_choose_size_and_steps_which_the_user_may_replace(
     handed_over: Callable[..., dict[str, str]],
 ) -> None:
     words = handed_over(Mixture(0, 8), "garden", "--minutes", "10")
-    # 1e5 pixels and Gaussians a step take 10 ms; 600 s are for more than the most steps.
+    # A step takes 10 ms; 600 s are for more than the most steps.
     assert (words["train.steps"], words["preset"]) == ("30000", "paper")
     words = handed_over(Mixture(0, 8), "garden", "--minutes", "1")
     assert 3000 < int(words["train.steps"]) < 6000

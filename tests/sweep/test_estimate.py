@@ -172,6 +172,7 @@ def test_damaged_cells_are_left_out(past: Past, spoilt: str) -> None:
         (["train.views=hr_only"], HR),
         (["train.views=lr_only", "train.hr_share=0.8"], LR),
         (["train.views=all_hr"], HR),
+        (["+ablation=supersampled"], (HR + 4 * LR) / 2),  # LR views at twice their size
     ],
 )
 def test_the_pixels_of_a_cell_are_those_of_the_views_that_it_draws(
@@ -182,7 +183,10 @@ def test_the_pixels_of_a_cell_are_those_of_the_views_that_it_draws(
     mean: float,
 ) -> None:
     def view(name: str, split: str, tag: str, side: int) -> SimpleNamespace:
-        return SimpleNamespace(name=name, split=split, tag=tag, width=side, height=side)
+        need = {"HR": 1.2, "LR": 4.8}[tag]
+        return SimpleNamespace(
+            name=name, split=split, tag=tag, width=side, height=side, supersampling=need
+        )
 
     views = [
         *(view(name, "train", "HR", 200) for name in "ab"),

@@ -34,6 +34,7 @@ from xrgs.store.store import BASELINE, Store
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from xrgs.bench.speed import Trial
     from xrgs.config import Conf
     from xrgs.store.cell_folder import CellFolder
     from xrgs.store.inspect import Mixture, SfmReport
@@ -122,17 +123,19 @@ def train(settings: Settings) -> None:
     if settings.out is not None:
         form_of(settings.out)
     words = _words(settings)
-    unit = _measured_unit(words.compose()) if settings.minutes else None
-    if settings.minutes and unit and settings.size is None:
-        words.own.append(f"variant.long_side={budget.size_for(60 * settings.minutes, unit)}")
+    if settings.minutes and settings.size is None:
+        side = budget.size_for(60 * settings.minutes, _measured_unit(words.compose()))
+        words.own.append(f"variant.long_side={side}")
     with exit_on_signal("Run the same command again to continue."):
         found = _look(words)
         if found is None:
             return
         words.own += _recipe(settings.recipe or found.mixture.recipe)
-        if settings.minutes and unit:
-            left = 60 * settings.minutes - (time.monotonic() - begin)
-            _choose_steps(found, words, settings, unit, left)
+        trial = None
+        if settings.minutes:
+            trial = _tried(found, words.compose())
+            left = 60 * settings.minutes - (time.monotonic() - begin) - trial.start_s
+            _choose_steps(words, settings, trial.step_s, left)
         steps = words.compose().train.steps
         if steps < _LONG_RUN:
             words.own.append(f"splat.densify.every={_REFINED_EVERY * NOMINAL_STEPS // steps}")
@@ -142,7 +145,7 @@ def train(settings: Settings) -> None:
         if _cell(found, conf).state(verify=False).name == "done":
             _say(f"trained already by {what}")
         else:
-            _say(f"training by {what}, {format_duration(_expected_s(found, conf, unit))}")
+            _say(f"training by {what}, {format_duration(_expected_s(found, conf, trial))}")
     again = "the command above continues" if settings.minutes else "run it again to continue"
     hint = f"What is done is kept: {again}."
     sweep.run("xrgs-train", [*words.all, "hydra.sweeper.brief=true"], hint)
@@ -222,12 +225,17 @@ def _measured_unit(conf: Conf) -> float:
     return seconds_per_unit(conf.threads or usable_cores(), conf.splat.backend)
 
 
-def _choose_steps(
-    found: _Found, words: _Words, settings: Settings, unit: float, left_s: float
-) -> None:
+def _tried(found: _Found, conf: Conf) -> Trial:
+    """Measure how quickly this machine trains these photographs."""
+    from xrgs.bench.speed import trial
+
+    return trial(conf, Store(conf.store).variants / found.variant_id)
+
+
+def _choose_steps(words: _Words, settings: Settings, step_s: float, left_s: float) -> None:
     """Choose the steps for the time that is left, and say how to have the same ones again."""
     conf = words.compose()
-    steps = budget.steps_for(left_s, unit * _units_of_a_step(found, conf))
+    steps = budget.steps_for(left_s, step_s)
     quality = "high" if steps >= _LONG_RUN else "normal"
     side = conf.variant.long_side
     words.own += [*_QUALITIES[quality], f"variant.long_side={side}", f"train.steps={steps}"]
@@ -240,17 +248,17 @@ def _choose_steps(
     _say(f"chosen for {settings.minutes:g} min; the same again, bit for bit: {shlex.join(again)}")
 
 
-def _expected_s(found: _Found, conf: Conf, unit: float | None) -> float:
-    """Return the expected seconds of a training, from finished cells or a measurement."""
+def _expected_s(found: _Found, conf: Conf, trial: Trial | None) -> float:
+    """Return the expected seconds of a training: of the trial, finished cells or a measurement."""
     from xrgs.sweep.estimate import CostEstimator
 
-    if unit is None:
-        threads = conf.threads or usable_cores()
-        cost = CostEstimator(Store(conf.store)).cost(conf, found.variant_id, threads)
-        if cost is not None:
-            return cost.seconds
-        unit = _measured_unit(conf)
-    return conf.train.steps * unit * _units_of_a_step(found, conf)
+    if trial is not None:
+        return trial.start_s + conf.train.steps * trial.step_s
+    threads = conf.threads or usable_cores()
+    cost = CostEstimator(Store(conf.store)).cost(conf, found.variant_id, threads)
+    if cost is not None:
+        return cost.seconds
+    return conf.train.steps * _measured_unit(conf) * _units_of_a_step(found, conf)
 
 
 def _units_of_a_step(found: _Found, conf: Conf) -> float:

@@ -197,7 +197,7 @@ def read_views(variants: Path, variant_id: str) -> tuple[ViewEntry, ...]:
 
 
 def _pixels(variants: Path, variant_id: str, conf: Conf) -> tuple[float, int]:
-    """Return the pixels of a cell's training views: the mean over the steps, and the largest.
+    """Return the pixels that a cell renders, mean over the steps, and those of its largest view.
 
     Raises:
         StoreError: The variant's list of views can't be read, or has none that is trained on.
@@ -214,15 +214,21 @@ def _pixels(variants: Path, variant_id: str, conf: Conf) -> tuple[float, int]:
     }
     if not by_name:
         raise StoreError(f"variant {variant_id}: no view for train.views={conf.train.views}")
+    most = conf.components.supersampled.factor
     hr, lr = (
-        [view.width * view.height for view in by_name.values() if view.tag == tag]
+        [
+            view.width * view.height * min(max(1, round(view.supersampling)), most) ** 2
+            for view in by_name.values()
+            if view.tag == tag
+        ]
         for tag in ("HR", "LR")
     )
+    largest = max(view.width * view.height for view in by_name.values())
     share = len(hr) / len(by_name)
     if hr and lr:
         share = max(share, conf.train.hr_share)
     mean = sum(drawn * fmean(of) for of, drawn in ((hr, share), (lr, 1 - share)) if of)
-    return mean, max(hr + lr)
+    return mean, largest
 
 
 def units_of_a_step(store: Store, conf: Conf, variant_id: str) -> float:
