@@ -16,6 +16,7 @@ from xrgs import plugins
 from xrgs.composing import from_dict
 from xrgs.config import Conf
 from xrgs.errors import XrgsError
+from xrgs.safeio import code
 from xrgs.store import identity
 from xrgs.store.identity import cell_id, cell_identity, changed_code
 from xrgs.training import components
@@ -163,7 +164,7 @@ def test_a_plugin_without_source_is_refused(install: Install) -> None:
     install("dist", {"one": "not_there:Plugin", "two": "space.not_there:Plugin"}, {"space/x": ""})
     for name in ("one", "two"):
         with pytest.raises(XrgsError, match=rf"plugins\.{name}: .*names no module"):
-            plugins.code_digest(name)
+            plugins.code_digest(name, identity.CODE)
 
 
 def test_the_identity_has_the_source_and_imports_none_of_it(
@@ -182,12 +183,14 @@ def test_the_identity_has_the_source_and_imports_none_of_it(
     points = {"a": "package.part:Plugin", "b": "space.inner.part:Plugin", "c": "single:Plugin"}
     folder = install("dist", points, dict.fromkeys([*counts, *other], "1 / 0"))
     baseline.components.plugins = {name: {} for name in points}
-    before = {name: plugins.code_digest(name) for name in points}
+    before = {name: plugins.code_digest(name, identity.CODE) for name in points}
     code = cell_identity(baseline, "v").code
     assert {f"plugins/{name}": value for name, value in before.items()}.items() <= code.items()
     for file in (*counts, *other):
         (folder / file).write_text("2 / 0")
-        changed = {name for name in points if plugins.code_digest(name) != before[name]}
+        changed = {
+            name for name in points if plugins.code_digest(name, identity.CODE) != before[name]
+        }
         assert changed == ({counts[file]} if file in counts else set()), file
         (folder / file).write_text("1 / 0")
     assert not {"package", "space", "space.inner", "single"} & set(sys.modules)
@@ -231,13 +234,13 @@ def test_the_built_in_components_that_a_plugin_extends_are_part_of_its_code(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     install("dist", {"one": "one:Plugin"}, {"one.py": f"{line}\n{SOURCE}"})
-    copy = shutil.copytree(Path(components.__file__).parent, tmp_path / "training/components")
-    monkeypatch.setattr(plugins, "__file__", str(copy.parent / "plugins.py"))
-    before, changed = plugins.code_digest("one"), set()
+    copy = shutil.copytree(code.PACKAGE, tmp_path / "xrgs") / "training/components"
+    monkeypatch.setattr(code, "PACKAGE", tmp_path / "xrgs")
+    before, changed = plugins.code_digest("one", identity.CODE), set()
     for file in copy.glob("*.py"):
         text = file.read_text()
         file.write_text(f"{text}\nEDITED = 1\n")
-        if plugins.code_digest("one") != before:
+        if plugins.code_digest("one", identity.CODE) != before:
             changed.add(file.stem)
         file.write_text(text)
     assert changed == counts

@@ -12,7 +12,6 @@ This module does not import torch, so that planning and reporting can use it.
 
 from __future__ import annotations
 
-import ast
 import dataclasses
 from importlib.machinery import PathFinder
 from importlib.metadata import EntryPoint, entry_points
@@ -25,16 +24,15 @@ from xrgs.safeio.code import digest_files
 from xrgs.safeio.hashing import digest
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Iterator, Mapping
     from importlib.machinery import ModuleSpec
+
+    from xrgs.safeio.code import CodeFolders
 
 GROUP = "xrgs.components"
 """The entry point group in which packages offer components."""
 
 _BYTECODE = frozenset({".pyc", ".pyo"})
-_COMPONENTS = "xrgs.training.components."
-#: Modules of that package which the core of an identity has.
-_SHARED = frozenset({"__init__", "base", "combined"})
 _Settings = TypeVar("_Settings")
 
 
@@ -70,7 +68,7 @@ def find(name: str) -> EntryPoint:
     return points[0]
 
 
-def code_digest(name: str) -> str:
+def code_digest(name: str, folders: CodeFolders) -> str:
     """Return a digest of a plugin's source, without importing its package.
 
     It covers the entry point's value and every file of the package that the entry point names (or
@@ -80,6 +78,7 @@ def code_digest(name: str) -> str:
 
     Args:
         name: The name of the plugin.
+        folders: The code of xrgs that trains; built-in components are parts of it.
 
     Raises:
         XrgsError: The plugin is not installed, or has no source file.
@@ -95,7 +94,7 @@ def code_digest(name: str) -> str:
     base = origin.parent.parent if is_package else origin.parent
     files = _package_files(origin.parent) if is_package else [origin]
     found = {file.relative_to(base).as_posix(): file for file in files}
-    found |= _built_in(file for file in found.values() if file.suffix == ".py")
+    found |= folders.needed_by(found.values())
     return digest([point.value, digest_files(found)])
 
 
@@ -192,27 +191,3 @@ def _package_files(folder: Path) -> Iterator[Path]:
         hidden = any(part.startswith(".") for part in parts)
         if file.is_file() and not hidden and file.suffix not in _BYTECODE:
             yield file
-
-
-def _built_in(files: Iterable[Path]) -> dict[str, Path]:
-    """The modules of built-in components that Python files import, and that these import."""
-    found: dict[str, Path] = {}
-    waiting = [*files]
-    while waiting:
-        for name in _imported_components(waiting.pop()):
-            file = Path(__file__).parent / "components" / f"{name}.py"
-            if name not in _SHARED and _COMPONENTS + name not in found and file.is_file():
-                found[_COMPONENTS + name] = file
-                waiting.append(file)
-    return found
-
-
-def _imported_components(file: Path) -> Iterator[str]:
-    """What a Python file imports from `xrgs.training.components`: names of modules and others."""
-    for node in ast.walk(ast.parse(file.read_bytes())):
-        if not isinstance(node, (ast.Import, ast.ImportFrom)):
-            continue
-        package = f"{node.module}." if isinstance(node, ast.ImportFrom) else ""
-        for name in (package + alias.name for alias in node.names):
-            if name.startswith(_COMPONENTS):
-                yield name.removeprefix(_COMPONENTS).partition(".")[0]

@@ -71,11 +71,24 @@ class CodeFolders:
         others = {*self.core(), *self.registries}
         return tuple(sorted(self._with_imports({file}, others)))
 
+    def needed_by(self, files: Iterable[Path]) -> dict[str, Path]:
+        """Return the parts that source files import, with what these need, by their names.
+
+        Args:
+            files: Files that need not be of this package.
+        """
+        core = {*self.core()}
+        imported = {name for file in files for name in _imported(file)} - core
+        parts = {name for name in imported if _is_in(name, self.folders_of_parts)}
+        return {name: PACKAGE / name for name in self._with_imports(parts, core | self.registries)}
+
     def _with_imports(self, files: set[str], end: Iterable[str]) -> set[str]:
         """Add what files import of `folders_of_parts`, and what that imports, up to an end."""
         files, pending = set(files), list(files)
         while pending:
-            found = {n for n in _imported(pending.pop()) if _is_in(n, self.folders_of_parts)}
+            found = {
+                n for n in _imported(PACKAGE / pending.pop()) if _is_in(n, self.folders_of_parts)
+            }
             pending += found - files - {*end}
             files |= found - {*end}
         return files
@@ -89,9 +102,8 @@ def _is_in(name: str, folders: Iterable[str]) -> bool:
     return any(name.startswith(f"{folder}/") for folder in folders)
 
 
-def _imported(name: str) -> set[str]:
+def _imported(file: Path) -> set[str]:
     """Return the files of this package that a file imports, for types alone too."""
-    file = PACKAGE / name
     if file.suffix != ".py":
         return set()
     imported = {_file_of(dotted) for dotted in _own_imports(file, file.stat().st_mtime_ns)}

@@ -131,7 +131,7 @@ def code_now(
     code = {part: canonical(part, code_digest(*names)) for part, names in files.items()}
     if order := order_of(components):  # of the components' hooks
         code["order"] = order
-    code |= {f"plugins/{name}": plugins.code_digest(name) for name in plugin_names}
+    code |= {f"plugins/{name}": plugins.code_digest(name, CODE) for name in plugin_names}
     return {part: digest for part, digest in code.items() if digest != ABSENT}
 
 
