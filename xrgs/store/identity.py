@@ -96,15 +96,14 @@ def cell_id(identity: Identity) -> str:
     return digest(msgspec.to_builtins(identity))
 
 
-@cache
-def training_code(
+def code_now(
     backend: str,
     components: tuple[str, ...] = (),
     plugin_names: tuple[str, ...] = (),
     init: str = "sfm",
     strategy: str = "default",
 ) -> dict[str, str]:
-    """Return the digest of each part of the code that trains a cell; files are read once.
+    """Return the digest of each part of the code that trains a cell, of the files as they are now.
 
     Args:
         backend: `native`, `torch` or `gsplat`.
@@ -116,23 +115,16 @@ def training_code(
     Raises:
         XrgsError: A plugin is not installed, or has no source file.
     """
-    return code_now(backend, components, plugin_names, init, strategy)
-
-
-def code_now(
-    backend: str,
-    components: tuple[str, ...] = (),
-    plugin_names: tuple[str, ...] = (),
-    init: str = "sfm",
-    strategy: str = "default",
-) -> dict[str, str]:
-    """Return `training_code` of the files as they are now, edited meanwhile or not."""
     files = _files(backend, components, init, strategy)
     code = {part: canonical(part, code_digest(*names)) for part, names in files.items()}
     if order := order_of(components):  # of the components' hooks
         code["order"] = order
     code |= {f"plugins/{name}": plugins.code_digest(name, CODE) for name in plugin_names}
     return {part: digest for part, digest in code.items() if digest != ABSENT}
+
+
+training_code = cache(code_now)
+"""`code_now` of the files as they were when this process first asked, which a plan needs often."""
 
 
 def _files(
