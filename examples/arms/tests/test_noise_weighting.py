@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -162,15 +161,17 @@ def noisy(data: Dataset) -> Dataset:
 
 
 def test_a_noisy_photograph_weighs_less_in_training(
-    noisy: Dataset, caplog: pytest.LogCaptureFixture
+    noisy: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    settings = ("train.steps=300", "splat.backend=auto", "splat.densify.stop=15000")
-    with caplog.at_level(logging.INFO):
-        result = train(noisy, with_arms(*settings, "+ablation=noise_weighting"))
-    assert (
-        "noise_weighting: the weights of the LR photographs are 0.250 (v3) to 1.000 (v1)"
-        in caplog.text
+    found: list[str] = []
+    monkeypatch.setattr(
+        NoiseWeighting, "after_training", lambda self, _: found.extend(self.findings())
     )
+    settings = ("train.steps=300", "splat.backend=auto", "splat.densify.stop=15000")
+    result = train(noisy, with_arms(*settings, "+ablation=noise_weighting"))
+    assert found == [
+        "noise_weighting: the weights of the LR photographs are 0.250 (v3) to 1.000 (v1)"
+    ]
     before, after = result.history[:150], result.history[150:]
     assert {row["noise_weighting.LR"] for row in before} == {None}
     weights = {row["view"]: row["noise_weighting.LR"] for row in after}
