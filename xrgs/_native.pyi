@@ -1,12 +1,14 @@
 """The compiled kernels of `xrgs/csrc`: the types of what each family's bind.cpp defines.
 
-Their docstrings are in the module (`help(xrgs._native)`). Tensors are float32, on the CPU and
-contiguous.
+Their docstrings are in the module (`help(xrgs._native)`). Tensors and arrays are float32 unless
+noted, on the CPU and contiguous.
 """
 
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
 def isa() -> str: ...
@@ -58,6 +60,21 @@ def resample(
     column_weights: Tensor,
     threads: int,
 ) -> Tensor: ...
+def plane_sweep_costs(
+    windows: list[NDArray[np.float32]],
+    a: list[NDArray[np.float32]],
+    b: list[NDArray[np.float32]],
+    images: list[NDArray[np.float32]],
+    used: list[NDArray[np.bool_]],
+    inverse_depths: NDArray[np.float32],
+    best: int,
+    noise: float,
+    nearest: float,
+    costs: NDArray[np.float32],
+) -> None: ...
+def semiglobal_sums(
+    costs: NDArray[np.float32], jump: float, step: float, sums: NDArray[np.float32]
+) -> None: ...
 
 class RenderConfig:
     def __init__(

@@ -15,6 +15,7 @@
 #include "raster/frame.h"
 #include "resample/bind.h"
 #include "simd/array_math.h"
+#include "stereo/bind.h"
 
 namespace nb = nanobind;
 
@@ -80,4 +81,5 @@ NB_MODULE(_native, m) {
   bind_loss(m);
   bind_optim(m);
   bind_resample(m);
+  bind_stereo(m);
 }

@@ -12,6 +12,7 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -204,6 +205,22 @@ def test_resample(size: tuple[int, int]) -> None:
     assert_every_failure_is_an_error(
         lambda: [native.resample(image, *matrices, THREADS)], at_least=3
     )
+
+
+def test_plane_sweep() -> None:
+    image = np.random.default_rng(0).random((20, 30)).astype(np.float32)
+    padded = np.pad(image, ((0, 1), (0, 1)), mode="edge")
+    directions = np.stack([image, image, np.ones_like(image)])
+    shift, depths = np.ones(3, np.float32), np.ones((2, 1, 1), np.float32)
+    other = ([directions], [shift], [padded], [np.empty((0, 0), bool)])
+
+    def run() -> Results:
+        costs, sums = (np.empty((2, 20, 30), np.float32) for _ in range(2))
+        native.plane_sweep_costs([image] * 4, *other, depths, 1, 1e-5, 1e-6, costs)
+        native.semiglobal_sums(costs, 0.2, 0.015, sums)
+        return [torch.from_numpy(costs), torch.from_numpy(sums)]
+
+    assert_every_failure_is_an_error(run, at_least=3)
 
 
 FEWER_THREADS = """

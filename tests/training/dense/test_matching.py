@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 
 from tests.training.dense.conftest import TrueScene
 from xrgs.training.dense.levels import swept_views
@@ -68,3 +71,27 @@ def test_fewer_views_than_the_best_are_enough(scene: TrueScene) -> None:
     np.testing.assert_allclose(
         1 - volume[0], Windows(level.gray).zncc(level.gray).clip(0), atol=1e-3
     )
+
+
+@pytest.mark.parametrize("per_pixel", [False, True])
+def test_compiled_costs_are_those_of_numpy_to_the_bit(scene: TrueScene, per_pixel: bool) -> None:
+    """With every instruction set, with masks, and with pixels outside other views and behind."""
+    native = pytest.importorskip("xrgs._native")
+    rng = np.random.default_rng(0)
+    views = [view.finest for view in swept_views(scene.data.train[:6], "torch")]
+    level, *others = (
+        replace(v, used=rng.random(v.used.shape) > n / 9) for n, v in enumerate(views)
+    )
+    shape = (7, *level.gray.shape) if per_pixel else (7, 1, 1)
+    inverse_depths = rng.uniform(-0.1, 1.5, shape).astype(np.float32)
+    expected = costs(level, others, inverse_depths)
+    assert 0.05 < (expected < 1).mean() < 0.99  # otherwise nothing would be compared
+    selected = native.isa()
+    try:
+        for isa in native.available_isas():
+            native.set_isa(isa)
+            np.testing.assert_array_equal(costs(level, others, inverse_depths, "native"), expected)
+            two = costs(level, others[:2], inverse_depths, "native")
+            np.testing.assert_array_equal(two, costs(level, others[:2], inverse_depths))
+    finally:
+        native.set_isa(selected)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from xrgs.training.dense.semiglobal import JUMP, STEP, minimum, smoothed
@@ -42,6 +43,13 @@ def test_four_directions_are_summed() -> None:
         line = costs[:, :, column].T
         expected[:, :, column] += (along(line) + along(line[::-1])[::-1]).T
     np.testing.assert_allclose(smoothed(costs.astype(np.float32)), expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("shape", [(5, 4, 6), (3, 33, 1), (1, 2, 50)])
+def test_compiled_sums_are_those_of_numpy_to_the_bit(shape: tuple[int, int, int]) -> None:
+    pytest.importorskip("xrgs._native")
+    costs = np.random.default_rng(1).random(shape).astype(np.float32)
+    np.testing.assert_array_equal(smoothed(costs, "native"), smoothed(costs))
 
 
 def test_the_least_cost_of_a_parabola_is_found_between_planes() -> None:

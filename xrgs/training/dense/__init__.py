@@ -59,7 +59,7 @@ def dense_start(
     Args:
         data: The training views and the SfM points.
         sparse: The Gaussians on the SfM points.
-        backend: `torch` or `native`: the implementation that resamples photographs.
+        backend: `torch` or `native`: what resamples photographs and compares them.
         generator: Draws the quaternions.
 
     Returns:
@@ -67,7 +67,7 @@ def dense_start(
         would harm.
     """
     views = swept_views(data.train, backend)
-    maps = list(find_depths(views, data.points.double().numpy()).values())
+    maps = list(find_depths(views, data.points.double().numpy(), backend).values())
     good = share_good(views, maps)
     if good < LEAST_GOOD:
         return _off(sparse, f"{good:.0%} of the depths hold in several views", LEAST_GOOD)

@@ -138,24 +138,31 @@ def _displacement(level: Level, others: Sequence[Level], far: float, near: float
     return sorted(moves)[len(moves) // 2]
 
 
-def sweep(views: Sequence[SweptView], planes: Planes, number: int) -> DepthMap:
+def sweep(
+    views: Sequence[SweptView], planes: Planes, number: int, backend: str = "torch"
+) -> DepthMap:
     """Find the depths of one view.
 
     Args:
         views: All views.
         planes: The planes of the view.
         number: The number of the view.
+        backend: `native` for the compiled kernels, which give the same bits; else numpy.
     """
     view, nearest = views[number], planes.neighbours[:NEIGHBOURS]
     inverse_depths = planes.inverse_depths[:, None, None]
-    volume = costs(view.coarse, [views[n].coarse for n in nearest], inverse_depths)
-    coarse = planes.inverse_depths[0] + planes.step * minimum(smoothed(volume))
-    fine = _refined(view, [views[n] for n in planes.neighbours], planes, coarse)
+    volume = costs(view.coarse, [views[n].coarse for n in nearest], inverse_depths, backend)
+    coarse = planes.inverse_depths[0] + planes.step * minimum(smoothed(volume, backend))
+    fine = _refined(view, [views[n] for n in planes.neighbours], planes, coarse, backend)
     return DepthMap(view, fine, view.finest.used, float(planes.step), nearest)
 
 
 def _refined(
-    view: SweptView, neighbours: Sequence[SweptView], planes: Planes, coarse: Floats
+    view: SweptView,
+    neighbours: Sequence[SweptView],
+    planes: Planes,
+    coarse: Floats,
+    backend: str,
 ) -> Floats:
     """Compare depths [h, w] about those of the coarse level on the finest one."""
     if view.fine is not None:
@@ -169,7 +176,7 @@ def _refined(
     depths = enlarged(coarse, *level.gray.shape)
     for _ in range(_REFINEMENTS):
         around = np.maximum(depths + offsets[:, None, None], far / 2)
-        place = minimum(smoothed(costs(level, others, around)))
+        place = minimum(smoothed(costs(level, others, around, backend), backend))
         depths = np.maximum(depths + offsets[0] + (offsets[1] - offsets[0]) * place, far / 2)
         depths = evened(median_filter(depths, _WINDOW, mode="nearest"), planes.step)
     return depths

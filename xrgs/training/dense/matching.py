@@ -75,7 +75,9 @@ def box_sum(image: Floats) -> Floats:
     return both
 
 
-def costs(level: Level, others: Sequence[Level], inverse_depths: Floats) -> Floats:
+def costs(
+    level: Level, others: Sequence[Level], inverse_depths: Floats, backend: str = "torch"
+) -> Floats:
     """How badly each pixel fits at each of its inverse depths: 1 - its score, in 0..1.
 
     The score is the mean of the `BEST` highest correlations with other views. A correlation below 0
@@ -85,6 +87,7 @@ def costs(level: Level, others: Sequence[Level], inverse_depths: Floats) -> Floa
         level: The view, [h, w].
         others: Other views.
         inverse_depths: [D, h, w] or [D, 1, 1], 1 / world units.
+        backend: `native` for the compiled kernels, which give the same bits; else numpy.
 
     Returns:
         [D, h, w]
@@ -92,6 +95,9 @@ def costs(level: Level, others: Sequence[Level], inverse_depths: Floats) -> Floa
     size = level.gray.shape
     windows, paths = Windows(level.gray), [_Path(level, other) for other in others]
     result = np.empty((len(inverse_depths), *size), np.float32)
+    if backend == "native":
+        _native_costs(windows, paths, inverse_depths, result)
+        return result
     for part in _parts(len(inverse_depths), size[0] * size[1]):
         highest = [np.zeros_like(result[part]) for _ in range(min(BEST, len(others)))]
         for path in paths:
@@ -106,6 +112,27 @@ def costs(level: Level, others: Sequence[Level], inverse_depths: Floats) -> Floa
             total += best
         result[part] = 1 - total / len(highest)
     return result
+
+
+def _native_costs(
+    windows: Windows, paths: Sequence[_Path], inverse_depths: Floats, result: Floats
+) -> None:
+    """Write the costs [D, h, w] to `result`."""
+    from xrgs import _native  # not built where the backend is torch
+
+    everywhere = np.empty((0, 0), bool)
+    _native.plane_sweep_costs(
+        [windows.image, windows.share, windows.mean, windows.variance],
+        [np.stack(path.directions) for path in paths],
+        [path.shift for path in paths],
+        [path.image for path in paths],
+        [everywhere if path.other.used.all() else path.other.used for path in paths],
+        inverse_depths,
+        min(BEST, len(paths)),
+        float(_NOISE),
+        float(_BEHIND),
+        result,
+    )
 
 
 def _parts(count: int, pixels: int) -> Iterator[slice]:
@@ -123,7 +150,7 @@ class _Path:
         self.shift = shift.astype(np.float32)
         self.other = other
         # A row and a column more, so that the four neighbours of every place exist.
-        self.image = np.pad(other.gray, ((0, 1), (0, 1)), mode="edge").ravel()
+        self.image = np.pad(other.gray, ((0, 1), (0, 1)), mode="edge")
 
     def sample(self, inverse_depths: Floats) -> tuple[Floats, Bools]:
         """Sample the other image where the pixels [h, w] are at their inverse depths [d, ...].
@@ -143,7 +170,7 @@ class _Path:
         (column, right), (row, down) = _place(x, width), _place(y, height)
         index = row * (width + 1) + column
         corners = [
-            np.take(self.image, index + offset, mode="clip")
+            np.take(self.image, index + offset, mode="clip")  # of the flat image
             for offset in (0, 1, width + 1, width + 2)
         ]
         top = corners[0] + right * (corners[1] - corners[0])

@@ -12,7 +12,7 @@ JUMP = 0.2
 """The penalty of any larger difference; our choice."""
 
 
-def smoothed(costs: Floats) -> Floats:
+def smoothed(costs: Floats, backend: str = "torch") -> Floats:
     """Sum the costs along the lines that lead to each pixel from left, right, above and below.
 
     Along a line, with p' the pixel before p,
@@ -23,12 +23,14 @@ def smoothed(costs: Floats) -> Floats:
 
     Args:
         costs: C [D, h, w].
+        backend: As for `costs`.
 
     Returns:
         [D, h, w] the sum of L over the four directions.
     """
-    by_column = _both_ways(np.ascontiguousarray(costs.transpose(2, 0, 1)))  # [w, D, h]
-    by_row = _both_ways(np.ascontiguousarray(costs.transpose(1, 0, 2)))  # [h, D, w]
+    both_ways = _native_both_ways if backend == "native" else _both_ways
+    by_column = both_ways(np.ascontiguousarray(costs.transpose(2, 0, 1)))  # [w, D, h]
+    by_row = both_ways(np.ascontiguousarray(costs.transpose(1, 0, 2)))  # [h, D, w]
     total: Floats = by_column.transpose(1, 2, 0) + by_row.transpose(1, 0, 2)
     return total
 
@@ -46,6 +48,14 @@ def _both_ways(costs: Floats) -> Floats:
     for place in range(len(costs) - 2, -1, -1):
         path = _next(path, costs[place])
         total[place] += path
+    return total
+
+
+def _native_both_ways(costs: Floats) -> Floats:
+    from xrgs import _native  # not built where the backend is torch
+
+    total = np.empty_like(costs)
+    _native.semiglobal_sums(costs, JUMP, STEP, total)
     return total
 
 

@@ -32,12 +32,15 @@ class Squares:
     """[N] world units."""
 
 
-def find_depths(views: Sequence[SweptView], points: Doubles) -> dict[int, DepthMap]:
+def find_depths(
+    views: Sequence[SweptView], points: Doubles, backend: str = "torch"
+) -> dict[int, DepthMap]:
     """Sweep every view, and check its depths against those of others.
 
     Args:
         views: The training views.
         points: SfM points [P, 3], world units.
+        backend: As for `sweep`.
 
     Returns:
         The depths by the numbers of the views, without the views that can't be swept.
@@ -45,7 +48,7 @@ def find_depths(views: Sequence[SweptView], points: Doubles) -> dict[int, DepthM
     planes = choose_planes(views, points)
     # A thread for each view, and one thread within: the bits are the same for any number.
     with single_torch_thread() as threads, ThreadPoolExecutor(threads) as pool:
-        swept = pool.map(lambda number: sweep(views, planes[number], number), planes)
+        swept = pool.map(lambda number: sweep(views, planes[number], number, backend), planes)
         found = dict(zip(planes, progress(swept, "dense start", "view", len(planes)), strict=True))
         for check in (consistent, not_seen_through):
             passed = list(pool.map(partial(check, found), found))
