@@ -112,12 +112,12 @@ class Camera:
             x, y and z [P] each in camera coordinates, world units, of the points' type. z is the
             depth.
         """
-        x, y, z = points.unbind(-1)
-        # Written out, as in `position`.
-        first, second, third = (
-            row[0] * x + row[1] * y + row[2] * z + row[3] for row in self.viewmat[:3].to(points)
-        )
-        return first, second, third
+        first, second = (_along(row, points) for row in self.viewmat[:2])
+        return first, second, self.depths(points)
+
+    def depths(self, points: Tensor) -> Tensor:
+        """Return the depths [P] of points [P, 3] in front of the camera, world units."""
+        return _along(self.viewmat[2], points)
 
     def in_image(
         self, points: Tensor, *, near: float = 0.0, margin: float = 0.0
@@ -183,3 +183,10 @@ class Camera:
         focal = 0.5 * width / math.tan(math.radians(fov) / 2)
         K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
         return cls(viewmat, K, width, height)
+
+
+def _along(row: Tensor, points: Tensor) -> Tensor:
+    """Return a coordinate [P] of points [P, 3], by its row [4] of a world-to-camera matrix."""
+    # Written out, as in `Camera.position`.
+    (x, y, z), row = points.unbind(-1), row.to(points)
+    return row[0] * x + row[1] * y + row[2] * z + row[3]

@@ -23,7 +23,7 @@ import msgspec
 
 from xrgs.errors import XrgsError
 from xrgs.runtime import processes
-from xrgs.runtime.machine import set_portable_blas
+from xrgs.runtime.machine import set_huge_pages, set_portable_blas
 from xrgs.runtime.signals import StopRequest, StopSignal, end_by_sigterm
 from xrgs.runtime.streams import guard_streams, log_to_stderr, say
 from xrgs.safeio.atomic import write_json
@@ -109,6 +109,7 @@ def run_in_child(
         WorkerError: The work failed; the message is the reason.
     """
     set_portable_blas()  # before the child loads it
+    set_huge_pages()  # before the child allocates anything
     try:
         temporary = tempfile.TemporaryDirectory(prefix="xrgs-")
     except FileNotFoundError as error:  # /tmp can't be written, nor any other usual place

@@ -89,11 +89,12 @@ class Floaters(Component):
         due = step.number % every == 0 or step.number == step.total - 1
         if not due:
             return None
-        means = gaussians.means.detach()
+        means = gaussians.means.detach().T.contiguous().T  # each coordinate side by side in memory
         too_near = torch.zeros(len(gaussians), dtype=torch.bool, device=means.device)
         for name, camera in self.cameras.items():
-            _, _, depth, inside = camera.in_image(means)
-            too_near |= inside & (depth < self.settings.near_share * self.near[name])
+            near = camera.depths(means) < self.settings.near_share * self.near[name]
+            index = near.nonzero()[:, 0]  # few: only these are projected
+            too_near[index] |= camera.in_image(means[index])[3]
         self.removed += int(too_near.sum())
         return too_near
 
