@@ -15,7 +15,7 @@ pytest.importorskip("submitit", reason="pip install 'xrgs[submitit]'")
 from submitit.slurm.slurm import SlurmJob
 
 from xrgs.sweep import submitit_jobs
-from xrgs.sweep.jobs.job import INTERRUPTED
+from xrgs.sweep.job import INTERRUPTED
 
 
 @pytest.fixture

@@ -23,8 +23,8 @@ from xrgs.safeio.sanitize import counted
 from xrgs.store import trimming
 from xrgs.store.inspect import read_report
 from xrgs.store.store import StoreGoneError
-from xrgs.sweep.jobs import worker
-from xrgs.sweep.jobs.supervise import Limits
+from xrgs.sweep import job
+from xrgs.sweep.job import Limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -58,7 +58,7 @@ def build(conf: Conf, store: Store) -> str:
         store: The store to build it in.
 
     Raises:
-        UnwritableError: The disk is full or can't be written.
+        WorkError: The build failed, or the disk is full or can't be written.
         UnreadableError: A file can't be read now.
         StoreGoneError: The store is no longer there.
         XrgsError: The photographs are missing, or can't be made into a variant.
@@ -83,29 +83,8 @@ def _build(
         work = "finding the cameras" if conf.variant.poses is None else "reading the cameras"
     log_line(f"{scenes.label(conf.scene)}: {work}{place}")
     request = {"conf": asdict(conf), "store": str(store.path)}
-    answer = worker.run_in_child("variant", request, Limits(), lambda _: check(), environment)
+    answer = job.run_in_child("variant", request, Limits(), lambda _: check(), environment)
     return str(answer["variant"])
-
-
-def restore(conf: Conf, store: Store, variant_id: str) -> None:
-    """Make the images of a trimmed variant again, in a child process.
-
-    Args:
-        conf: The config of a cell of the variant, of which only scene and variant are read.
-        store: The store.
-        variant_id: The variant's id. A variant that is not trimmed is left as it is.
-
-    Raises:
-        UnwritableError: The disk is full or can't be written.
-        UnreadableError: A file can't be read now.
-        StoreGoneError: The store is no longer there.
-        XrgsError: The photographs are missing, or give other images.
-    """
-    if not trimmed_folder(store.variants, variant_id).is_dir():
-        return
-    log_line(f"variant {variant_id}: making the images again that xrgs-store trim has removed")
-    request = {"conf": asdict(conf), "store": str(store.path), "variant": variant_id}
-    worker.run_in_child("restore", request, Limits(), lambda _: store.check_not_gone())
 
 
 def how_to_get(scenes: Iterable[SceneConf]) -> str:
@@ -226,7 +205,7 @@ def _build_all(lacking: Mapping[int, Conf], total: int, store: Store) -> dict[in
     def check() -> None:
         store.check_not_gone()
         if ended.is_set():
-            raise worker.InterruptedWorkError("the sweep has ended")
+            raise job.WorkError("the sweep has ended", job.STOPPED)
 
     def build_one(i: int, conf: Conf, store: Store) -> PlannedVariant:
         place = f" {i + 1} of {total}" if total > 1 else ""
@@ -257,8 +236,6 @@ def _outcome(
     """
     try:
         return work(conf, store)
-    except worker.UnwritableError as error:
-        raise StoreError(f"store={store.path}: {error}. {worker.NOTHING_LOST}") from error
     except StoreGoneError:
         raise
     except OSError as error:
@@ -266,6 +243,8 @@ def _outcome(
             raise
         return PlannedVariant(error=str(error))
     except XrgsError as error:
+        if isinstance(error, job.WorkError) and error.outcome == job.UNWRITABLE:
+            raise StoreError(f"store={store.path}: {error}. {job.NOTHING_LOST}") from error
         if building:
             store.check_not_gone()
             # COLMAP dies of a full disk without saying so. The scene is not at fault then.

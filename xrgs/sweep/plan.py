@@ -7,17 +7,19 @@ from typing import TYPE_CHECKING
 
 from xrgs.errors import XrgsError
 from xrgs.mixture.paths import TO_TRY
+from xrgs.mixture.split import check_variant_conf
 from xrgs.photos import scenes
 from xrgs.runtime.machine import usable_memory
 from xrgs.runtime.text import format_duration, format_size
 from xrgs.safeio.hashing import digest, to_plain
 from xrgs.safeio.sanitize import counted, for_line
 from xrgs.splat.backend import resolve_backend
+from xrgs.splat.settings import SSIM_WINDOW
 from xrgs.store.cell_folder import CellState
 from xrgs.store.identity import cell_id, cell_identity
 from xrgs.store.schema import RecordedCell
 from xrgs.store.store import BASELINE
-from xrgs.sweep.build_variants import how_to_get
+from xrgs.sweep import build_variants
 from xrgs.sweep.estimate import TORCH_SLOWDOWN
 
 if TYPE_CHECKING:
@@ -113,6 +115,52 @@ def planned(spec: CellSpec, conf: Conf) -> PlannedCell:
     if conf.matched_to is not None:
         spec = replace(spec, label=f"{spec.label} to {conf.matched_to}")
     return PlannedCell(spec, conf)
+
+
+def check_sizes(conf: Conf) -> None:
+    """Refuse a config with images too small for SSIM, or with invalid values of its variant.
+
+    Raises:
+        XrgsError: A value is out of its range; the message names the key.
+    """
+    check_variant_conf(conf.variant)
+    side, least = conf.variant.long_side, conf.variant.factor * SSIM_WINDOW
+    if 0 < side < least:
+        raise XrgsError(
+            f"variant.long_side={side}: must be 0 (the photographs' size) or at least {least}, so"
+            f" that LR views have the {SSIM_WINDOW} px a side that SSIM needs"
+        )
+
+
+def with_variants(
+    plan: Sequence[PlannedCell], store: Store, *, allow_build: bool
+) -> tuple[list[PlannedCell], list[str]]:
+    """Return the cells with their variants, or with the reasons why there are none.
+
+    Args:
+        plan: The cells.
+        store: The store.
+        allow_build: Build the variants that the store lacks; False for a dry run.
+
+    Returns:
+        The cells, and the notes on the variants, each with its scene.
+
+    Raises:
+        StoreError: The store can't be written, or is no longer there.
+    """
+    keys = [digest([to_plain(cell.conf.scene), to_plain(cell.conf.variant)]) for cell in plan]
+    confs = {key: cell.conf for key, cell in zip(keys, plan, strict=True)}
+    built = build_variants.plan([*confs.values()], store, allow_build=allow_build)
+    variants = dict(zip(confs, built, strict=True))
+    notes: dict[str, None] = {}
+    cells = []
+    for key, cell in zip(keys, plan, strict=True):
+        variant = variants[key]
+        cells.append(
+            replace(cell, variant_id=variant.id, error=variant.error, remembered=variant.remembered)
+        )
+        notes |= dict.fromkeys(f"{scenes.label(cell.conf.scene)}: {n}" for n in variant.notes)
+    return cells, list(notes)
 
 
 def with_wanted_baselines(plan: Sequence[PlannedCell]) -> list[PlannedCell]:
@@ -225,7 +273,7 @@ def describe(plan: Sequence[PlannedCell]) -> str:
         lines.append("failed cells are not trained again; retry=failed trains them again")
     if any(cell.not_placed for cell in plan):
         lines += TO_TRY
-    if hint := how_to_get([cell.conf.scene for cell in plan if cell.error]):
+    if hint := build_variants.how_to_get([cell.conf.scene for cell in plan if cell.error]):
         lines.append(hint)
     return "\n".join(map(for_line, lines))
 

@@ -28,10 +28,9 @@ from xrgs.store.attempts import begin_attempt, plan_cell
 from xrgs.store.cell_folder import CellFolder
 from xrgs.store.identity import cell_identity
 from xrgs.store.store import Store
-from xrgs.sweep import build_variants
+from xrgs.sweep import build_variants, job
 from xrgs.sweep.axes import CellSpec
 from xrgs.sweep.estimate import Cost
-from xrgs.sweep.jobs import worker
 from xrgs.sweep.monitor import SweepMonitor
 from xrgs.sweep.plan import PlannedCell
 
@@ -230,7 +229,7 @@ def _provide(variant_id: str, conf: Conf, store: Store) -> None:
         XrgsError: It is not, and building it again gives another variant; or its images were
             removed on purpose, and can't be made again.
     """
-    build_variants.restore(conf, store, variant_id)
+    job.restore_images(conf, store, variant_id)
     if (store.variants / variant_id).is_dir():
         return
     log_line(f"variant {variant_id} is not in {store.path} and is built again")
@@ -286,7 +285,7 @@ def _train_again(
     try:
         with SweepMonitor(repeated.path.parent) as monitor:
             monitor.watch([cell])
-            worker.run_in_child("cell", worker.cell_request(variant, repeated))
+            job.run_in_child("cell", job.cell_request(variant, repeated))
     except XrgsError as error:
         repeated.fail(str(error))
         raise XrgsError(f"{error} ({repeated.path / 'log.txt'})") from error

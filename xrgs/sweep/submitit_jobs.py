@@ -15,7 +15,7 @@ from submitit.core.core import Job
 from submitit.slurm.slurm import SlurmInfoWatcher, SlurmJob
 
 from xrgs.errors import XrgsError
-from xrgs.sweep.jobs.job import INTERRUPTED
+from xrgs.sweep.job import INTERRUPTED
 
 #: Seconds between two looks at SLURM's queue, which remembers ended jobs for five minutes.
 _LOOK_S = 30
