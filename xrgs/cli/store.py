@@ -229,24 +229,6 @@ def rescore(cells: Filter, also: Names = ()) -> None:
         sys.exit(1)
 
 
-def prove(cells: Filter, sample: Annotated[int, shown_as("N")] = 2) -> None:
-    """Prove that a refactoring changes no number, so that finished cells keep their ids.
-
-    Some done cells, which the code before the refactoring has trained, are trained again with the
-    installed code, and some variants are built again. If all bits are equal, the new code is
-    declared equal to the old one, in xrgs/safeio/refactorings.json of the installed package.
-
-    Args:
-        cells: The cells that pass all of these options.
-        sample: Number of cells or variants that are made again for each part of the code that has
-            changed.
-    """
-    from xrgs.sweep.refactoring import prove as proven
-
-    _, chosen = cells.chosen()
-    say(str(proven(Store(cells.store), [cell.folder for cell in chosen], sample)))
-
-
 def check(store: Folder = STORE) -> None:
     """Hash every file of the finished cells, the variants, the rendered scenes and the sweeps.
 
@@ -298,7 +280,6 @@ def main() -> None:
         "import": import_,
         "gc": gc,
         "rescore": rescore,
-        "prove": prove,
         "check": check,
     }
     with exit_on_signal("What was not removed yet is unchanged."):

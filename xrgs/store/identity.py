@@ -7,7 +7,7 @@
    backend or the dense start count where it is on, and all others always.
 4. Scores are apart: metrics and the evaluation protocol have digests of their own
    (`xrgs.store.scoring`), and `xrgs-store rescore` makes scores anew.
-5. A refactoring that changes no number keeps its cells: `xrgs-store prove` trains a sample of cells
+5. A refactoring that changes no number keeps its cells: `.ci/prove` trains a sample of cells
    again, and declares the digests of the old and the new code equal where all bits are.
 6. Any other change of the hashed code makes new ids.
 
