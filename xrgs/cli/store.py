@@ -55,7 +55,7 @@ class Filter:
     def chosen(self) -> tuple[list[CellRow], list[CellRow]]:
         """Return all cells of the store, and the cells that are meant."""
         cells = Store(self.store).cell_rows()
-        return cells, self.selection().of(cells)
+        return cells, self.selection().choose_from(cells)
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ def show(cell: Positional[Annotated[str, arg(metavar="CELL")]], store: Folder = 
     from xrgs.store.listing import Selection
     from xrgs.sweep.inventory import show as described
 
-    (chosen,) = Selection(ids=(cell,)).of(Store(store).cell_rows())
+    (chosen,) = Selection(ids=(cell,)).choose_from(Store(store).cell_rows())
     say(described(Store(store), chosen))
 
 

@@ -227,8 +227,8 @@ def _run_under_lease(
         restore_images(conf, store, identity.variant)
     if not variant.is_dir():
         raise XrgsError(f"{name}: its variant {variant} is missing")
-    held = lease.acquire(store.leases, cell.id)
-    if held is None:
+    cell_lease = lease.acquire(store.leases, cell.id)
+    if cell_lease is None:
         log_line(f"{cell.id}: another sweep is training this cell; this sweep leaves it")
         return LOCKED
     try:
@@ -238,13 +238,13 @@ def _run_under_lease(
         if state.unreadable or state.name == "done":  # another sweep has finished it meanwhile
             return state.name
         _check_code(name, cell.id, conf, identity)
-        if not begin_attempt(cell, held.beat):
+        if not begin_attempt(cell, cell_lease.beat):
             return _lost(cell)
         if not session.brief:
             log_line(f"{name}: training cell {cell.id}")
-        return _train_in_child(cell, conf, store, variant, held, session)
+        return _train_in_child(cell, conf, store, variant, cell_lease, session)
     finally:
-        held.release()
+        cell_lease.release()
 
 
 def _check_code(name: str, cell_id: str, conf: Conf, planned: Identity) -> None:

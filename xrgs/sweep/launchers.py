@@ -78,9 +78,9 @@ def _ray(launcher: DictConfig, threads: int, _machine: int) -> Capacity:
     return Capacity(cores=cores, settings=settings)
 
 
-#: The capacity of each launcher, by its class: a function of `hydra.launcher`, the threads that a
-#: cell asks for (0 for no preference) and the cores of this machine. Another launcher is one
-#: function and one line.
+#: Class of a launcher -> function that returns its capacity. The arguments are `hydra.launcher`,
+#: the threads that a cell asks for (0 for no preference) and the cores of this machine. Another
+#: launcher takes one function and one line.
 CAPACITIES: dict[str, Callable[[DictConfig, int, int], Capacity]] = {
     "BasicLauncher": _basic,
     "JoblibLauncher": _joblib,
@@ -137,8 +137,8 @@ def capacity(launcher: DictConfig, threads: int, machine: int) -> Capacity:
     Raises:
         XrgsError: The launcher's configuration is invalid.
     """
-    known = CAPACITIES.get(str(launcher["_target_"]).rpartition(".")[2])
-    return known(launcher, threads, machine) if known else Capacity(cores=threads)
+    capacity_of = CAPACITIES.get(str(launcher["_target_"]).rpartition(".")[2])
+    return capacity_of(launcher, threads, machine) if capacity_of else Capacity(cores=threads)
 
 
 def check(config: DictConfig, cell: DictConfig | None = None) -> None:

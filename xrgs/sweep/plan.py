@@ -100,18 +100,18 @@ class PlannedCell:
 
 
 def planned(spec: CellSpec, conf: Conf) -> PlannedCell:
-    """Return a planned cell; add to label and condition what only the config tells.
+    """Return a planned cell, with two additions from its config.
 
-    The label names the reference of a count-matched cell. The condition names the scored
-    views if they are not test views, so that nobody takes their scores for scores of test views.
+    The label of a count-matched cell gets the name of its reference. The condition gets the scored
+    views where these are not test views, so that nobody takes their scores for those of test views.
     """
-    said = spec.condition
+    scored = ""
     if conf.train.validation:
-        key = "train.validation="
-        said = said if key in said else f"{said} {key}{conf.train.validation}"
-    elif conf.variant.test_every == 0 and not conf.variant.test and _ON_TRAINING_VIEWS not in said:
-        said = f"{said} {_ON_TRAINING_VIEWS}"
-    spec = replace(spec, condition=said.lstrip())
+        if "train.validation=" not in spec.condition:
+            scored = f"train.validation={conf.train.validation}"
+    elif conf.variant.test_every == 0 and not conf.variant.test:
+        scored = "" if _ON_TRAINING_VIEWS in spec.condition else _ON_TRAINING_VIEWS
+    spec = replace(spec, condition=f"{spec.condition} {scored}".strip())
     if conf.matched_to is not None:
         spec = replace(spec, label=f"{spec.label} to {conf.matched_to}")
     return PlannedCell(spec, conf)
@@ -205,7 +205,7 @@ def identified(cell: PlannedCell, store: Store, holders: Mapping[str, str]) -> P
 
 
 def estimated(plan: Sequence[PlannedCell], past: CostEstimator, threads: int) -> list[PlannedCell]:
-    """Return the cells with their costs, as far as known.
+    """Return the cells with their expected costs; without, where the store has no finished cell.
 
     Args:
         plan: The cells.
@@ -256,13 +256,13 @@ def describe(plan: Sequence[PlannedCell]) -> str:
     """
     done = sum(cell.state.name == "done" for cell in plan)
     lines = [f"plan: {counted(len(plan), 'cell')}, {done} done{_remaining(plan)}"]
-    said = set[str]()
+    reasons = set[str]()
     for cell in plan:
         state, reason = _shown_state(cell)
-        if reason in said:
+        if reason in reasons:
             reason = "the same"
         elif reason:
-            said.add(reason)
+            reasons.add(reason)
         cell_id = cell.cell_id or ("no count yet" if state == "waits" else "variant not built")
         to_train = not cell.error and state != "done"
         time_left = format_duration(cell.seconds) if to_train else ""
@@ -295,9 +295,9 @@ def without_kernels(plan: Sequence[PlannedCell]) -> str:
     ]
     if not cells:
         return ""
-    known = [cell.seconds for cell in cells if cell.seconds is not None]
-    torch, native = (format_duration(sum(known) / ratio) for ratio in (1.0, TORCH_SLOWDOWN))
-    complete = len(known) == len(cells)
+    estimates = [cell.seconds for cell in cells if cell.seconds is not None]
+    torch, native = (format_duration(sum(estimates) / ratio) for ratio in (1.0, TORCH_SLOWDOWN))
+    complete = len(estimates) == len(cells)
     instead = f"{torch} instead of {native}" if complete else "30 to 60 times longer"
     return (
         "the kernels were not built on this machine: torch trains"
@@ -361,12 +361,12 @@ def left_to_train(plan: Sequence[PlannedCell]) -> list[PlannedCell]:
 def _remaining(plan: Sequence[PlannedCell]) -> str:
     """Return the expected time of the remaining training, as far as known."""
     remaining = left_to_train(plan)
-    known = [cell.seconds for cell in remaining if cell.seconds is not None]
-    if not known:
+    estimates = [cell.seconds for cell in remaining if cell.seconds is not None]
+    if not estimates:
         return ""
-    unknown = len(remaining) - len(known)
+    unknown = len(remaining) - len(estimates)
     more = f" and {counted(unknown, 'cell')} without an estimate" if unknown else ""
-    return f"; left to train, one after another: {format_duration(sum(known))}{more}"
+    return f"; left to train, one after another: {format_duration(sum(estimates))}{more}"
 
 
 def record(plan: Sequence[PlannedCell]) -> list[RecordedCell]:

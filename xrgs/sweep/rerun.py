@@ -1,4 +1,4 @@
-"""Trains a finished cell again from its folder alone, and compares the results.
+"""Trains a finished cell again from nothing but its folder, and compares the results.
 
 The cell's config says how to train, and its identity names the variant to train on. Differences of
 the program, its libraries and the machine are reported before the training: they explain other
@@ -188,9 +188,9 @@ def _other_program(original: CellFolder, conf: Conf, now: Identity) -> Iterator[
         if then.code.get(part) != now.code.get(part):
             yield f"code: {part}: {then.code.get(part)} -> {now.code.get(part)}"
     here = provenance.collect(conf.threads or usable_cores(), conf.splat.backend)
-    told = {"started", "arithmetic", "machines_in_turn"}
+    not_compared = {"started", "arithmetic", "machines_in_turn"}
     before, after = (
-        _without(msgspec.to_builtins(one), told) for one in (original.provenance(), here)
+        _without(msgspec.to_builtins(one), not_compared) for one in (original.provenance(), here)
     )
     yield from _changes(before, after)
 
@@ -335,8 +335,8 @@ def _score_differences(original: CellFolder, repeated: CellFolder) -> Iterator[s
         if a != b and not (math.isnan(a) and math.isnan(b)):
             differences_of.setdefault(metric, []).append(abs(a - b))
     for metric, differences in sorted(differences_of.items()):
-        known = [difference for difference in differences if not math.isnan(difference)]
-        amount = f"by at most {max(known):.3g}" if known else "and one of the two has no score"
+        numbers = [difference for difference in differences if not math.isnan(difference)]
+        amount = f"by at most {max(numbers):.3g}" if numbers else "and one of the two has no score"
         yield f"{metric}: differs in {len(differences)} views, {amount}"
 
 

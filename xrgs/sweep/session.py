@@ -20,7 +20,7 @@ _MAX_REASON = 1 << 12  # bytes of the file `stopped`
 
 @dataclass(frozen=True)
 class SweepSession:
-    """One call of `xrgs-sweep`, whose jobs know it by its folder."""
+    """One call of `xrgs-sweep`; a job knows the call by this folder."""
 
     folder: Path
     brief: bool = False
@@ -47,11 +47,11 @@ class SweepSession:
 
     def end(self) -> None:
         """Remove the folder when no job is left, unless a launcher has left its logs in it."""
-        own = {self.folder / "sweep", self.folder / "stopped"}
-        with suppress(OSError):  # it disturbs nobody
-            for of_job in set(self.folder.iterdir()) - own:
-                of_job.rmdir()  # fails where there are logs: then all of the folder stays
-            for file in own:
+        files = {self.folder / "sweep", self.folder / "stopped"}
+        with suppress(OSError):  # a folder that stays disturbs nobody
+            for job_folder in set(self.folder.iterdir()) - files:
+                job_folder.rmdir()  # fails where there are logs: then all of the folder stays
+            for file in files:
                 file.unlink(missing_ok=True)
             self.folder.rmdir()
 

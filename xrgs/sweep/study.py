@@ -134,7 +134,7 @@ class Study:
             arguments: Hydra overrides, with the axes among them.
 
         Raises:
-            CompactHydraException: The user can correct the problem; Hydra prints the message alone.
+            CompactHydraException: The user can correct the problem; Hydra prints only the message.
             SystemExit: With code 1 if a cell failed; the table is printed first.
         """
         try:
@@ -285,17 +285,17 @@ class Study:
 
     def _with_effective_match(self, spec: CellSpec) -> CellSpec:
         """Drop `matched_to` unless the ablation is count-matched."""
-        alone = spec.without_match
-        if alone == spec or self._compose(alone).matched_to is not None:
+        unmatched = spec.without_match
+        if unmatched == spec or self._compose(unmatched).matched_to is not None:
             return spec
-        return alone
+        return unmatched
 
     def _identified(self, plan: Sequence[PlannedCell], store: Store) -> list[PlannedCell]:
         """Return the cells with their counts, identities and states, as far as known."""
         cells: dict[CellSpec, PlannedCell] = {}
         holders = lease.holders(store.leases)
-        for known in plan:
-            cell = identified(self._with_count(known, cells, store), store, holders)
+        for earlier in plan:
+            cell = identified(self._with_count(earlier, cells, store), store, holders)
             cells[cell.spec] = cell
         return list(cells.values())
 
@@ -324,16 +324,16 @@ class Study:
         return self._confs[overrides]
 
     def _hydra_config(self, overrides: tuple[str, ...]) -> DictConfig:
-        """Return Hydra's config; those that differ in numbers alone share one composition.
+        """Return Hydra's config. Configs that differ only in numbers share one composition.
 
         Composing takes 0.1 s.
         """
         numbers = {text: match for text in overrides if (match := _NUMBER.fullmatch(text))}
-        alike = tuple(numbers[text][1] if text in numbers else text for text in overrides)
-        if alike not in self._composed:
+        shared = tuple(numbers[text][1] if text in numbers else text for text in overrides)
+        if shared not in self._composed:
             loader = self._context.config_loader
-            self._composed[alike] = loader.load_sweep_config(self._config, [*overrides])
-        composed = self._composed[alike]
+            self._composed[shared] = loader.load_sweep_config(self._config, [*overrides])
+        composed = self._composed[shared]
         for match in numbers.values():
             OmegaConf.update(composed, match[1], json.loads(match[2]))  # ${seed} follows seed
         launchers.check(self._config, composed)
@@ -346,7 +346,7 @@ class Launches:
     def __init__(self, context: HydraContext, task: TaskFunction, config: DictConfig) -> None:
         """Prepare to launch, as `Study`; nothing is written before the first launch."""
         self._name = str(config.hydra.runtime.choices["hydra/launcher"])
-        loader = cast("ConfigLoader", _JobConfigLoader())  # launchers call nothing else of it
+        loader = cast("ConfigLoader", _JobConfigLoader())  # launchers call no other method
         self._context = HydraContext(loader, context.callbacks)
         self._task = task
         self._config = copy.deepcopy(config)
@@ -405,7 +405,7 @@ class Launches:
         return outcomes
 
     def _batches(self, cells: Sequence[PlannedCell], size: int) -> list[Sequence[PlannedCell]]:
-        """Divide cells into batches; cells that may have broken a launcher come last, alone."""
+        """Divide cells into batches. Cells that may have broken a launcher come last, one each."""
         others = [cell for cell in cells if cell.cell_id not in self._suspects]
         suspects = [cell for cell in cells if cell.cell_id in self._suspects]
         return [
@@ -439,7 +439,7 @@ class Launches:
         }
 
     def _outcome(self, cell: PlannedCell, job: JobReturn, store: Store) -> str:
-        """Return what `run_job` returned. An exception in a job concerns its own cell alone."""
+        """Return what `run_job` returned. An exception in a job concerns only its own cell."""
         try:
             answer = str(job.return_value)
         except Exception as error:  # submitit raises for a job that was out of time too often
@@ -505,7 +505,7 @@ class _JobConfigLoader:
         config = OmegaConf.masked_copy(master_config, ["hydra"])
         with flag_override(config, ["readonly", "struct"], False):
             for override in overrides:
-                # As text: an id of digits alone, or like 12e4567..., would be parsed as a number.
+                # As text: an id of digits only, or like 12e4567..., would be parsed as a number.
                 key, _, value = override.partition("=")
                 config[key] = escape_interpolations(value)
         with flag_override(config.hydra, ["readonly", "struct"], False):
@@ -557,15 +557,15 @@ def _hand_over(cell: PlannedCell, threads: int, store: Store) -> list[str]:
         threads=cell.conf.threads or threads,
         scene=replace(scene, path=path, masks=masks),
     )
-    # Under the lease: another sweep may be training the cell, or have finished it, since the plan.
-    held = lease.acquire(store.leases, cell.cell_id)
-    if held is not None:
+    # Under the lease: since the plan, another sweep may have begun or finished the cell.
+    cell_lease = lease.acquire(store.leases, cell.cell_id)
+    if cell_lease is not None:
         try:
             state = store.cell(cell.cell_id).state(verify=False)
             if state.name != "done" and not state.unreadable:
                 plan_cell(store.cell(cell.cell_id), conf, cell.identity)
         finally:
-            held.release()
+            cell_lease.release()
     return [f"cell={cell.cell_id}", f"store={home}", f"name={cell.name}"]
 
 
@@ -601,16 +601,16 @@ def provide_lpips(*, fetch: bool, dry_run: bool) -> None:
 
 def _tidy(done: set[str], store: Store) -> None:
     """Remove checkpoints and leases of done cells, which a killed sweep has left."""
-    with suppress(OSError):  # they disturb nobody, and the next sweep removes them
+    with suppress(OSError):  # left-over files disturb nobody, and the next sweep removes them
         for cell_id in done:
             store.cell(cell_id).drop_checkpoint()
         for cell_id in done & lease.names(store.leases):
-            if (held := lease.acquire(store.leases, cell_id)) is not None:
-                held.release()
+            if (cell_lease := lease.acquire(store.leases, cell_id)) is not None:
+                cell_lease.release()
 
 
 def _without_reference(cell: PlannedCell) -> PlannedCell:
-    """Return a cell that waits for a count in vain with an error that says so."""
+    """Return a cell, with an error if it still waits for the count of its reference."""
     if cell.error is not None or not cell.waits:
         return cell
     return replace(cell, error=f"matched_to={cell.conf.matched_to}: that cell is not done")
