@@ -129,7 +129,7 @@ def wait_for_gpu() -> None:
 
 
 def gpus() -> list[str]:
-    """Return the GPUs of NVIDIA that this process may use, as CUDA_VISIBLE_DEVICES names them."""
+    """Return the NVIDIA GPUs that this process may use, as CUDA_VISIBLE_DEVICES names them."""
     visible = os.environ.get("CUDA_VISIBLE_DEVICES")
     if visible is not None:
         names = [name.strip() for name in visible.split(",")]

@@ -78,7 +78,7 @@ class TextTable:
 
     @property
     def heads(self) -> tuple[str, ...]:
-        """The heads of the columns, each after the heading over it."""
+        """The heads of the columns, each after the heading of its group."""
         if not self.spans:
             return self.columns
         above = [head for head, columns in self.spans for _ in range(columns)]

@@ -238,6 +238,6 @@ def _cut(text: str, spans: list[_Span]) -> str:
             line = lines[number].rstrip("\n")
             left = start if number == first - 1 else 0
             right = end if number == last - 1 else len(line)
-            # Columns stay what they are for other parts of the same line.
+            # Blanks keep the columns of other parts of the same line.
             lines[number] = line[:left] + " " * (right - left) + line[right:] + "\n"
     return "".join(lines)

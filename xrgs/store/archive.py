@@ -308,7 +308,7 @@ class _Import:
 
     store: Store
     left_out: dict[str, list[str]] = field(default_factory=dict)
-    """Reason -> the names of the items that are not imported for it."""
+    """Reason -> the names of the items that are left out for it."""
 
     @property
     def unpacked(self) -> Path:

@@ -93,7 +93,7 @@ def begin_attempt(cell: CellFolder, is_owner: Callable[[], bool] = lambda: True)
 def remove_cell(cell: CellFolder) -> None:
     """Remove a cell, whose lease the caller holds.
 
-    The folder is renamed first. Should a kill leave a part of it, that is no cell, and the next
+    The folder is renamed first. If a kill leaves a part of it, that part is no cell: the next
     attempt or `xrgs-store gc` removes it.
 
     Raises:

@@ -128,7 +128,7 @@ class CellCheckpoint(Checkpoint):
         if len(recorder.history) == self._rows:
             return 0.0
         with suppress(OSError):  # they are written again at the end, where an error counts
-            # Scores first: of every step in the history, the scores are then in the other file.
+            # The scores first, so that they are there for every step that the history has.
             write_curves(self._folder, recorder.history, recorder.scores)
         self._rows, end = len(recorder.history), time.monotonic()
         self._curves_due = end + _CURVES_S

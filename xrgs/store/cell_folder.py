@@ -226,7 +226,7 @@ class CellFolder:
         self._write_status(
             Status("done", views=tuple(views), files=files, scored_by=dict(scored_by))
         )
-        self.drop_checkpoint()  # after the status: a cell that is killed before needs it
+        self.drop_checkpoint()  # last: a cell that is killed before still needs it
 
     def rescored(self, names: Sequence[str], scored_by: Mapping[str, str]) -> None:
         """Keep new scores of a done cell: the caller has written them and holds the lease.

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from xrgs.mixture.views import Variant, View
 
-#: px: the box that the whole image is fitted into, the side of the centre beside it, and margins.
+#: In px: the box for the whole image, the side of the square centre beside it, and margins.
 _BOX = (256, 192)
 _CENTRE = 192
 _BORDER, _GAP, _TEXT = 4, 8, 16

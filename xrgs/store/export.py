@@ -241,7 +241,7 @@ def _write_nerfstudio(data: Dataset, images: list[PinholeImage], target: Path) -
         files[split].append(f"images/{name}")
     content = {
         "camera_model": "OPENCV",
-        "orientation_override": "none",  # the splats would not turn with the cameras
+        "orientation_override": "none",  # else nerfstudio turns the cameras, but not the splats
         "ply_file_path": "points.ply",
         "train_filenames": files["train"],
         "val_filenames": files["test"],

@@ -129,7 +129,7 @@ class SfmReport(Struct):
         Args:
             most: The most names in such a sentence.
         """
-        if not (self.hr or self.lr):  # of a scene that failed: the reason names the views
+        if not (self.hr or self.lr):  # a scene that failed, whose reason names the views
             return self.own_notes
         lost = (("trained on", self.not_trained), ("scored", self.not_scored))
         unplaced = [

@@ -117,7 +117,7 @@ def processor(made: Provenance) -> str:
 
 @cache
 def this_processor(backend: str) -> str:
-    """Return `processor` of a cell that this machine trains.
+    """Return the processor of this machine, named as by `processor`.
 
     Args:
         backend: The rasterizer in use: `native`, `torch` or `gsplat`.
@@ -130,7 +130,7 @@ def _processor(cpu: str | None, instruction_set: str | None) -> str:
 
 
 class Machines:
-    """The machines that train a cell in turn; its checkpoint hands their names on to the next."""
+    """The names of the machines that train a cell in turn; the checkpoint keeps them."""
 
     def __init__(self, here: str) -> None:
         """Begin with the machine of this process, `here`, see `machine`."""

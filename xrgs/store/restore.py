@@ -82,7 +82,7 @@ def _write_images(
     numbers = {name: number for number, name in enumerate(photos.names)}
     if missing := {entry.name for entry in entries} - numbers.keys():
         raise StoreError(f"{folder}: the photograph of its view {min(missing)} is missing")
-    # Each view that was degraded is also there as it was before.
+    # A view that was degraded has two entries; one is its original.
     degraded = {numbers[entry.name] for entry in entries if entry.split == "original"}
     write_degraded(photos, sorted(degraded), conf)
     for entry in progress(entries, "undistorting", "view"):

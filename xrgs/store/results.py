@@ -99,7 +99,7 @@ def over_views(views: pd.DataFrame) -> pd.DataFrame:
     errors = 10 ** (-views["psnr"] / 10)
     grouped = views.assign(psnr_pooled=errors, psnr_worst=views["psnr"]).groupby("cell_id")
     means = grouped.mean()
-    with np.errstate(divide="ignore"):  # no error at all is infinite PSNR
+    with np.errstate(divide="ignore"):  # an error of 0 gives infinite PSNR
         means["psnr_pooled"] = -10 * np.log10(means["psnr_pooled"])
     means["psnr_worst"] = grouped["psnr_worst"].min()
     return means.mask(grouped.count().lt(grouped.size(), axis=0))

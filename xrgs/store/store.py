@@ -109,7 +109,7 @@ class Store:
         """Whether the folder is a store: whether it is there and has a folder of cells.
 
         Raises:
-            StoreError: It can't be told now; the message names the folder.
+            StoreError: The folder can't be read now; the message names it.
         """
         try:
             return stat.S_ISDIR(self.cells_folder.stat().st_mode)
@@ -122,14 +122,14 @@ class Store:
         """Refuse a folder that is not a store.
 
         Raises:
-            StoreError: It is none, or it can't be told now.
+            StoreError: It is none, or can't be read now.
         """
         if not self.exists:
             raise StoreError(f"store={self.path} is not a store; xrgs-sweep makes one")
 
     @property
     def is_gone(self) -> bool:
-        """Whether a store that was prepared is no longer there; False where it can't be told now.
+        """Whether a store that was prepared is no longer there; False where it can't be read now.
 
         An empty folder in its place, as an unmounted disk leaves it, is no store.
         """
@@ -185,7 +185,7 @@ class Store:
         self._write_nameless(folder)
 
     def _write_nameless(self, folder: Path) -> None:
-        """Write a file that has no name into a folder, and so leave nothing behind."""
+        """Write a nameless file into a folder; it is gone when it is closed."""
         try:
             with tempfile.TemporaryFile(dir=folder) as file:
                 file.write(bytes(_MIN_FREE_BYTES))

@@ -101,7 +101,7 @@ def expand(arguments: Sequence[str], loader: ConfigLoader | None = None) -> list
 
 
 def _values(override: Override) -> list[str]:
-    """Return the override once for each of its values."""
+    """Return one override for each value of an axis."""
     key = override.get_key_element()
     try:
         if not override.is_sweep_override():

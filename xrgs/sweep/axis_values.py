@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from hydra.core.config_loader import ConfigLoader
     from hydra.core.override_parser.types import Override
 
-#: The most values of a range; without its step, a range of training steps has many more.
+#: The most values of a range. A range of training steps without a step would have more.
 _MOST_VALUES = 10_000
 _CASTS = ("int", "float", "str", "bool")
 

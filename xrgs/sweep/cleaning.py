@@ -55,7 +55,7 @@ class Item:
     lease: str | None
     """The name of the lease to hold while it is removed; None where it needs no lease."""
     act: Callable[[], str | None]
-    """Removes it; returns why it was left, if it was."""
+    """Removes the thing; returns the reason where it is left."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What a run says last: its cells, and the commands that lead on."""
+"""Writes the end of a run's output: its done cells, and the commands that come next."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 #: The most cells that are listed with their ids.
 _MAX_LISTED = 12
-#: The characters of an id that name a cell in a command.
+#: Number of characters of a cell's id in a command.
 _ID = 8
 
 

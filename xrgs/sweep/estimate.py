@@ -61,7 +61,7 @@ class Cost:
     """Size of its files when it is done."""
 
     def left_s(self, trained: float) -> float:
-        """Return the seconds to the end of a cell, with this share of its training done."""
+        """Return the seconds to the end of a cell of whose training this share is done."""
         return (1 - trained) * (self.seconds - self.scoring_s) + self.scoring_s
 
 
@@ -176,7 +176,7 @@ def _settings(conf: Conf) -> frozenset[tuple[str, str]]:
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Yield each of nested values with its key, as `splat.densify.every`."""
+    """Yield each value of nested dicts with its dotted key, as `splat.densify.every`."""
     for key, value in values.items():
         if isinstance(value, dict):
             yield from _flat(value, f"{prefix}{key}.")

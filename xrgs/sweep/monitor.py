@@ -371,7 +371,7 @@ class SweepMonitor:
         if self._bar is None:
             style = "{percentage:3.0f}%|{bar:20}| {desc}"
             self._bar = tqdm(None, bar_format=style, leave=False, dynamic_ncols=True, delay=1e-9)
-        # A training that starts again, as count_matched does, takes nothing back.
+        # Where a training starts again, as with count_matched, the bar stays where it was.
         shown = self._bar.n if self._bar.total == snapshot.total else 0
         self._bar.total, self._bar.n = snapshot.total, max(shown, snapshot.progress)
         self._bar.set_description_str(self._text(snapshot))

@@ -205,7 +205,7 @@ def identified(cell: PlannedCell, store: Store, holders: Mapping[str, str]) -> P
 
 
 def estimated(plan: Sequence[PlannedCell], past: CostEstimator, threads: int) -> list[PlannedCell]:
-    """Return the cells with their expected costs; without, where the store has no finished cell.
+    """Return the cells with their expected costs, where the store has finished cells to compare.
 
     Args:
         plan: The cells.

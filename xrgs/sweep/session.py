@@ -24,7 +24,7 @@ class SweepSession:
 
     folder: Path
     brief: bool = False
-    """Whether the jobs say failures only, as for `xrgs-train`."""
+    """Whether the jobs print only failures, as for `xrgs-train`."""
 
     @property
     def exists(self) -> bool:
@@ -40,7 +40,7 @@ class SweepSession:
         lease.sign(self.folder / "sweep")
 
     def stop(self, reason: str) -> None:
-        """Let no further job begin, for a reason that people can read; the first one is kept."""
+        """Let no further job begin; keep the reason, unless an earlier one is there."""
         # A full disk may have room for the file's name and none for the reason in it.
         with suppress(OSError), (self.folder / "stopped").open("xb") as stream:
             stream.write(reason.encode())

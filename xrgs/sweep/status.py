@@ -225,7 +225,7 @@ def watch(path: Path) -> None:
 
 
 def running(store: Store) -> str:
-    """Return the time, how far the sweeps of the cells in training are, and these cells.
+    """Return lines for `watch`: the time, the running sweeps, and the progress of their cells.
 
     Raises:
         StoreError: The store can't be read now.

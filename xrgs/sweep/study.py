@@ -125,7 +125,7 @@ class Study:
         self._composed: dict[tuple[str, ...], DictConfig] = {}
         self._confs: dict[tuple[str, ...], Conf] = {}
         self._store: Store | None = None
-        """The store, once it is prepared."""
+        """None until the store is prepared."""
 
     def run(self, arguments: Sequence[str]) -> None:
         """Plan the cells, build their variants, train unfinished cells, record and report.
@@ -315,7 +315,7 @@ class Study:
         return replace(cell, spec=spec, conf=self._compose(spec))
 
     def _compose(self, spec: CellSpec) -> Conf:
-        """Return a cell's config; it is composed once, and asked for by other cells as well."""
+        """Return a cell's config, composed once however often it is asked for."""
         overrides = tuple(spec.overrides)
         if overrides not in self._confs:
             conf = to_conf(self._hydra_config(overrides))

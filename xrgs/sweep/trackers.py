@@ -66,7 +66,7 @@ class Sink:
     """The last step that is there; -1 where none is."""
 
     def send(self, new: Curves) -> None:
-        """Add steps that are all later than `sent`, so that people who look now see them."""
+        """Add steps, all later than `sent`; people see them at once."""
         raise NotImplementedError
 
     def close(self, state: str) -> None:
