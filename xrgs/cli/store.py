@@ -1,4 +1,4 @@
-"""`xrgs-store`: lists, removes, packs, imports, scores anew and verifies what a store keeps."""
+"""`xrgs-store`: lists, removes, packs, imports, scores anew and verifies the items of a store."""
 
 from __future__ import annotations
 
@@ -246,7 +246,7 @@ def check(store: Folder = STORE) -> None:
 
 
 def _say_left(lines: Sequence[str]) -> None:
-    """Say what was left, and why.
+    """Print the lines on things that were left, with the reasons.
 
     Raises:
         SystemExit: With code 1, where anything was.

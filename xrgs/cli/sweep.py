@@ -40,7 +40,7 @@ Commas make axes, +ablation=[a,b] stacks. Finished cells are found in the store 
   seed=0,1    store=FOLDER    data_root=FOLDER    threads=N    dry_run=true
   limits.minutes=N  limits.memory_gb=N    end cells that exceed a limit, and count them as failed
   retry=failed      fail_fast=true        train failed cells again; stop after the first failure
-  baseline=false                          train the ablations alone
+  baseline=false                          train only the ablations
 
 xrgs-sweep rerun=CELL [out=FOLDER] [store=FOLDER] [threads=N] [scene.path=FOLDER]
            [plugins=NAME[,NAME]...]
@@ -117,7 +117,7 @@ def run(command: str, words: Sequence[str], hint: str) -> None:
     Args:
         command: Name of the command, which begins messages.
         words: The arguments of `xrgs-sweep`.
-        hint: What is said where a signal ends it: what is kept, and how to continue.
+        hint: A text for the end by a signal: what is kept, and how to continue.
 
     Raises:
         SystemExit: With code 1 where a cell failed; with a message where the user can correct the

@@ -1,7 +1,7 @@
 """Reads the vertices of a .ply file: ASCII or binary, any properties, among any other elements.
 
-The file may come from anybody. Nothing is allocated for what the header declares before the size of
-the file shows that it is there.
+The file may come from anybody. No memory is allocated for declared data before the size of the file
+shows that the data is there.
 """
 
 from __future__ import annotations

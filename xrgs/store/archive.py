@@ -240,7 +240,7 @@ def import_store(source: Path, store: Store) -> Imported:
 
     Cells that are not done, checkpoints, logs and reports are not imported. Each cell, variant,
     scene and record gets its name once it is whole and on the disk. An import that was stopped
-    goes on when it is run again: what it has imported is already there.
+    goes on when it is run again.
 
     Args:
         source: The archive (`.tar`, `.tar.xz`, `.tar.gz`, `.tar.bz2`), or the folder of a store.

@@ -220,7 +220,7 @@ def _train_and_score(
         trained.gaussians,
         antialiased=conf.splat.raster.antialiased,
         durable=False,
-        exact=True,  # what was scored, so that it can be scored again
+        exact=True,  # the very Gaussians that are scored, so that they can be scored again
     )
     write_curves(folder, trained.history, trained.scores)
     render_time_ms = protocol.render_time(trained.gaussians, data.test, conf.splat)

@@ -430,7 +430,7 @@ class CellFolder:
         return variant.load(variants / variant_id)
 
     def dataset(self) -> Dataset:
-        """Load what the cell was trained and scored on: photographs, cameras, points.
+        """Load the data that the cell was trained and scored on: photographs, cameras, points.
 
         With `train.validation`, `test` has the held-out training views that its scores are of.
         The cameras and points are in the normalised world of the Gaussians.

@@ -39,7 +39,7 @@ def contact_sheet(variant: Variant) -> tuple[Image.Image, list[str]]:
 
     Beside each image is its centre. The centre of a view that is smaller than the largest one is
     magnified by the nearest whole factor, each pixel a square, so that its missing detail can be
-    seen. What is outside a mask is dark.
+    seen. Pixels outside a mask are dark.
 
     Returns:
         An RGB image, and notes: why an image can't be read, or that some views are not drawn.

@@ -1,8 +1,8 @@
 """The identity of a cell: every value that can change one of its trained numbers, nothing else.
 
 1. Comments, docstrings and blank lines of the code change no id.
-2. What is off is absent: a component that is off, its settings and its module are not in the
-   identity, nor is any key at its `off` value (`xrgs.config.off`).
+2. A component that is off is not in the identity, nor are its settings and its module, nor any key
+   at its `off` value (`xrgs.config.off`).
 3. The code is every file of `splat/`, `training/` and `csrc/`. Files of a component, a strategy, a
    backend or the dense start count where it is on, and all others always.
 4. Scores are apart: metrics and the evaluation protocol have digests of their own
@@ -49,7 +49,7 @@ CODE = CodeFolders(
         | {file for key in BUILT_IN if (file := file_of(key))}
     ),
 )
-#: The parts of each backend. Of the kernels these are the C++ sources, and not the compiled module:
+#: The parts of each backend. The kernels count by their C++ sources, and not as compiled module:
 #: two builds of the same sources differ in their bytes and give the same numbers.
 _BACKENDS: dict[str, dict[str, tuple[str, ...]]] = {
     "native": {"native": ("splat/native", "csrc")},

@@ -74,7 +74,7 @@ class SfmReport(Struct):
     tags: str | None = None
     degradation: str | None = None
     notes: tuple[str, ...] = ()
-    """Sentences on what was taken, left out, turned, converted or masked, by photographs' names."""
+    """Sentences on photographs that were taken, left out, turned, converted or masked."""
     pose_error: dict[str, float] = {}
     """`position_percent` of the extent, `rotation_degrees`, and `..._max` of each."""
     pose_error_against: str = ""

@@ -295,7 +295,7 @@ def full_id(
     if len(matches) == 1:
         return next(iter(matches))
     some = listed([f"{full}{label}" for full, label in matches.items()], _MAX_LISTED)
-    why = f"no {kinds} have such an id, and no done cell is of such a scene"
+    why = f"no {kinds} have such an id, and no done cell is of a scene with this name"
     if matches:
         why = f"several {kinds} have such an id or scene: {some}"
     raise StoreError(f"{word}: {why}; xrgs-status lists the done ones")

@@ -226,7 +226,7 @@ class Store:
         return self.variants / variant_id
 
     def cells(self, *, verify: bool = True) -> pd.DataFrame:
-        """List the cells: what they are, whether they are done, and how they scored.
+        """List the cells: their names, configs, states and scores.
 
         `table.loc[:, table.astype(str).nunique() > 1]` keeps the columns in which cells differ.
 

@@ -1,4 +1,4 @@
-"""Removes the heavy files of done cells and of variants, and records what was removed.
+"""Removes the heavy files of done cells and of variants, and lists the removed files.
 
 A trimmed cell stays done: the files that tables are made of stay, and its `status.json` lists the
 removed files with their sizes and hashes. A trimmed variant keeps its list of views, cameras,

@@ -47,7 +47,7 @@ class PlannedVariant:
     remembered: bool = False
     """Whether the store keeps the error, so that only `retry=failed` tries the scene again."""
     notes: tuple[str, ...] = ()
-    """What its report says, or in a dry run what the report of a new variant would say."""
+    """The notes of its report; in a dry run, the notes that a new variant's report would have."""
 
 
 def build(conf: Conf, store: Store) -> str:

@@ -66,7 +66,7 @@ class Plan:
     """`remove` or `trim`."""
     items: tuple[Item, ...]
     notes: tuple[str, ...] = ()
-    """Lines on what is left alone, and why."""
+    """Lines on things that are left alone, with the reasons."""
 
     @property
     def total(self) -> str:
@@ -169,7 +169,7 @@ def plan_gc(store: Store, cells: Sequence[CellRow], of: Sequence[str]) -> Plan:
 
 
 def carry_out(store: Store, plan: Plan) -> tuple[int, list[str]]:
-    """Remove what a plan lists; an item that can't be removed hides no other.
+    """Remove the items of a plan; one that can't be removed does not keep the others.
 
     Returns:
         The number of bytes that were freed, and a line for each item that was left, with the

@@ -2,8 +2,8 @@
 
 The config of the nearest cells differs in the fewest keys; another variant, processor or backend
 counts as several keys. Time, memory and disk of such a cell are scaled by the pixels of a view, and
-its time by the steps and threads too. Of several equally near cells the median counts. A store
-without finished cells gives no estimate.
+its time by the steps and threads too. The median of equally near cells is taken. A store without
+finished cells gives no estimate.
 """
 
 from __future__ import annotations

@@ -89,7 +89,7 @@ def rerun(
             should depend on it.
         photographs: Replaces the config's `scene.path`, if the variant has to be built.
         plugins: Names of the components of other packages that may be imported. A cell that needs
-            another one is refused: a store must not decide what is imported.
+            another one is refused: a store must not decide which code is imported.
 
     Returns:
         The comparison.

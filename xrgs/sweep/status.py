@@ -62,8 +62,8 @@ class StoreStatus:
 def read(path: Path) -> StoreStatus:
     """Read the state of a store, and write nothing.
 
-    Of the cells' files the sizes are compared. Whatever can't be read is named among the problems,
-    and does not hide the rest.
+    The cells' files are checked by their sizes only. A file that can't be read is named among the
+    problems, and does not hide the rest.
 
     Args:
         path: The store's folder.

@@ -53,12 +53,12 @@ def check(kind: str) -> None:
 
 
 def curves(cell: CellFolder, *, done: bool) -> Curves:
-    """Read what a cell has written so far.
+    """Read the curves that a cell has written so far.
 
     Args:
         cell: The cell, which has written its first row.
         done: Whether the cell is done. Otherwise the curves end with the last row of the history:
-            what was evaluated after that row may not be complete.
+            scores of later steps may not be complete.
 
     Raises:
         StoreError: A file can't be read; the message names it.
@@ -263,5 +263,5 @@ class Tracker:
     def close(self) -> None:
         """End the runs that are still open: their cells were stopped."""
         for cell in self._cells.values():
-            with suppress(Exception):  # what was sent is there
+            with suppress(Exception):  # the steps that were sent are there
                 cell.close("stopped")
