@@ -24,10 +24,10 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TextIO
 
-from xrgs.sweep.jobs import supervise
+from xrgs.sweep import job
 
 #: The module that is the child of a sweep.
-WORKER = "xrgs.sweep.jobs.worker"
+WORKER = "xrgs.sweep.job"
 #: What the commands and the children of a sweep import, some of it late.
 MODULES = (
     *(f"xrgs.cli.{name}" for name in ("bench", "render", "report", "status", "store", "sweep")),
@@ -73,17 +73,17 @@ class _Handler(socketserver.StreamRequestHandler):
 
         def run_supervised(
             command: Sequence[str],
-            limits: supervise.Limits,
+            limits: job.Limits,
             on_poll: Callable[[int], None] = lambda _: None,
             environment: Mapping[str, str] = MappingProxyType({}),
-        ) -> supervise.ProcessEnd:
-            job = {"main": WORKER, "arguments": command[-3:], "printed": printed}
+        ) -> job.ProcessEnd:
+            child_main = {"main": WORKER, "arguments": command[-3:], "printed": printed}
             place = {"folder": str(Path.cwd()), "environment": os.environ | environment}
-            answers, child = ask(str(self.server.server_address), **job, **place)
+            answers, child = ask(str(self.server.server_address), **child_main, **place)
             on_poll(child)
-            return supervise.ProcessEnd(exit_code(answers))
+            return job.ProcessEnd(exit_code(answers))
 
-        supervise.run_supervised = run_supervised
+        job.run_supervised = run_supervised
         sys.argv = [main, *arguments]
         try:
             import_module(main).main(*arguments if main == WORKER else ())

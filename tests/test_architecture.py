@@ -76,7 +76,7 @@ LIGHT = (
     "sweep.build_variants",
     "sweep.cleaning",
     "sweep.inventory",
-    "sweep.jobs.job",
+    "sweep.job",
     "sweep.monitor",
     "sweep.rerun",
     "sweep.session",

@@ -409,7 +409,7 @@ def test_the_process_of_a_cell_reads_its_config_without_hydra(
 ) -> None:
     (file := tmp_path / "config.json").write_text(json.dumps(asdict(baseline)))
     script = (
-        "import sys; from pathlib import Path; import xrgs.sweep.jobs.worker, xrgs.store.cell;"
+        "import sys; from pathlib import Path; import xrgs.sweep.job, xrgs.store.cell;"
         "from xrgs.composing import from_dict, from_file;"
         f"conf, _ = from_file(Path({str(file)!r}));"
         "from dataclasses import asdict; assert from_dict(asdict(conf)) == conf;"

@@ -70,8 +70,15 @@ class Copy:
     def run(self, command: str, *arguments: str) -> str:
         """Run `xrgs-<command>` of the copy in its root; return what it printed, without errors."""
         code = f"import sys; sys.argv[0] = 'xrgs-{command}'; from xrgs.cli.{command} import main"
+        return self._python("-c", f"{code}; main()", *arguments)
+
+    def prove(self, *arguments: str) -> str:
+        """Run `.ci/prove` on the copy's store `s`."""
+        return self._python(str(ROOT / ".ci" / "prove"), "--store", "s", *arguments)
+
+    def _python(self, *arguments: str) -> str:
         done = subprocess.run(
-            [sys.executable, "-P", "-c", f"{code}; main()", *arguments],
+            [sys.executable, "-P", *arguments],
             cwd=self.root,
             env=os.environ | {"PYTHONPATH": str(self.root)},
             capture_output=True,
@@ -147,7 +154,7 @@ def test_a_refactoring_is_proven_and_keeps_its_cells(copy: Copy) -> None:
     before = json.loads(file.read_text())
     copy.edit("splat/settings.py", "NOMINAL_STEPS = 30_000", "NOMINAL_STEPS = 3 * 10_000")
     assert "2 cells, 0 done" in done_cells(copy)
-    printed = copy.run("store", "prove", "--store", "s", "--sample", "1")
+    printed = copy.prove("--sample", "1")
     assert "1 cell trained again, the same bit for bit" in printed
     declared = json.loads(file.read_text())
     assert len(declared["core"]) == len(before["core"]) + 1
@@ -160,7 +167,7 @@ def test_a_change_of_a_number_is_not_declared(copy: Copy) -> None:
     before = file.read_bytes()
     copy.edit("splat/settings.py", "NOMINAL_STEPS = 30_000", "NOMINAL_STEPS = 29_000")
     with pytest.raises(AssertionError, match="nothing is declared"):
-        copy.run("store", "prove", "--store", "s", "--sample", "1")
+        copy.prove("--sample", "1")
     assert file.read_bytes() == before
 
 
@@ -170,7 +177,7 @@ def test_a_refactoring_of_the_code_of_variants_is_proven_and_keeps_variants_and_
     before = json.loads((copy.root / "xrgs/safeio/refactorings.json").read_text())
     copy.edit("mixture/sfm.py", "_TOTAL_FEATURES = 100_000", "_TOTAL_FEATURES = 100 * 1_000")
     assert "2 cells, 0 done" in done_cells(copy)
-    printed = copy.run("store", "prove", "--store", "s")
+    printed = copy.prove()
     assert "1 variant built again, the same bit for bit" in printed
     declared = json.loads((copy.root / "xrgs/safeio/refactorings.json").read_text())
     assert "declared in refactorings.json: variant/core\n" in printed
@@ -183,7 +190,7 @@ def test_a_refactoring_of_the_code_of_variants_is_proven_and_keeps_variants_and_
     content["code"]["core"] = new
     file.write_text(json.dumps(content))
     with pytest.raises(AssertionError, match="no done cell was trained with other code"):
-        copy.run("store", "prove", "--store", "s")
+        copy.prove()
 
 
 def test_other_cameras_are_not_declared(copy: Copy) -> None:
@@ -191,7 +198,7 @@ def test_other_cameras_are_not_declared(copy: Copy) -> None:
     before = file.read_bytes()
     copy.edit("mixture/sfm.py", "_SMALL_SIDE = 800", "_SMALL_SIDE = 8")
     with pytest.raises(AssertionError, match="views, files differ; nothing is declared"):
-        copy.run("store", "prove", "--store", "s")
+        copy.prove()
     assert file.read_bytes() == before
     assert "2 cells, 0 done" in done_cells(copy)
 

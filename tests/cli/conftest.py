@@ -23,7 +23,7 @@ from xrgs.mixture import variant
 from xrgs.safeio.atomic import write_json
 from xrgs.store.cell_folder import CellFolder
 from xrgs.store.store import Store
-from xrgs.sweep.jobs import worker
+from xrgs.sweep import job
 
 RunCommand = Callable[..., tuple[int, str, str]]
 SMOKE = ("scene=motorcycle", "preset=smoke", "train.steps=8")
@@ -103,8 +103,8 @@ class Children:
     """A number of Gaussians that no count-matched cell reaches."""
     gaussians: int = 100
 
-    def run(self, job: str, request: Mapping[str, Any], *_: object) -> dict[str, Any]:
-        if job == "variant":
+    def run(self, work: str, request: Mapping[str, Any], *_: object) -> dict[str, Any]:
+        if work == "variant":
             made = Store(Path(request["store"])).variants / "0123456789abcdef-0123456789abcdef"
             made.mkdir(parents=True)
             return {"variant": made.name}
@@ -112,9 +112,9 @@ class Children:
         conf = folder.config()
         self.trained.append(folder.id)
         if conf.seed in self.failures:
-            raise worker.WorkerError(self.failures[conf.seed])
+            raise job.WorkError(self.failures[conf.seed])
         if conf.components.count_matched.gaussians == self.unreachable:
-            raise worker.WorkerError(f"no threshold gave {self.unreachable} Gaussians")
+            raise job.WorkError(f"no threshold gave {self.unreachable} Gaussians")
         finish(folder, gaussians=self.gaussians + len(self.trained))
         return {}
 
@@ -136,7 +136,7 @@ def finish(cell: CellFolder, gaussians: int) -> None:
 def children(monkeypatch: pytest.MonkeyPatch) -> Children:
     """Child processes that are not started, and a report that is not made."""
     made = Children()
-    monkeypatch.setattr(worker, "run_in_child", made.run)
+    monkeypatch.setattr(job, "run_in_child", made.run)
     monkeypatch.setattr(variant, "find", made.find)
     monkeypatch.setattr(xrgs.report, "build", lambda *_: SimpleNamespace(text="the table"))
     return made

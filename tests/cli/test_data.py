@@ -22,7 +22,7 @@ import xrgs
 import xrgs.store.inspect
 from xrgs.mixture import poses, variant
 from xrgs.store.cell_folder import CellFolder
-from xrgs.sweep.jobs import worker
+from xrgs.sweep import job
 
 XrgsData = Callable[..., tuple[int, str, str]]
 
@@ -40,11 +40,11 @@ def test_inspect_builds_a_variant_that_the_store_lacks(
 ) -> None:
     jobs = []
 
-    def build(job: str, request: dict[str, Any], *_: object) -> dict[str, Any]:
-        jobs.append((job, request["conf"]["scene"]["kind"]))
+    def build(work: str, request: dict[str, Any], *_: object) -> dict[str, Any]:
+        jobs.append((work, request["conf"]["scene"]["kind"]))
         return {"variant": "k-1"}
 
-    monkeypatch.setattr(worker, "run_in_child", build)
+    monkeypatch.setattr(job, "run_in_child", build)
     monkeypatch.setattr(variant, "find", lambda *_: SimpleNamespace(id="k-1") if built else None)
     monkeypatch.setattr(xrgs.store.inspect, "describe", lambda folder, out: f"{folder} {out}")
     code, out, err = xrgs_data("inspect", "scene=motorcycle", "store=s", "--out", "x.png")
@@ -66,7 +66,7 @@ def test_inspect_takes_a_folder_of_photographs_as_they_are(
         return {"variant": "k-1"}
 
     photographs(tmp_path / "garden", 4)
-    monkeypatch.setattr(worker, "run_in_child", build)
+    monkeypatch.setattr(job, "run_in_child", build)
     monkeypatch.setattr(variant, "find", lambda *_: None)
     monkeypatch.setattr(xrgs.store.inspect, "describe", lambda folder, out: f"{folder} {out}")
     code, out, err = xrgs_data(

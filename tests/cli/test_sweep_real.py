@@ -142,10 +142,10 @@ def test_the_child_imports_the_package_of_its_parent_and_not_that_of_its_folder(
 ) -> None:
     (tmp_path / "xrgs").mkdir()
     (tmp_path / "xrgs" / "__init__.py").write_text("raise ImportError('the wrong package')")
-    script = "import sys; sys.path.remove(''); from xrgs.sweep.jobs.worker import run_in_child; "
+    script = "import sys; sys.path.remove(''); from xrgs.sweep.job import run_in_child; "
     script += "run_in_child('cell', {'cell': 'gone', 'inode': 0})"
     done = subprocess.run(
         [sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=False
     )
-    assert "AttemptLostError: gone: another attempt at the cell has begun" in done.stderr
+    assert "WorkError: gone: another attempt at the cell has begun" in done.stderr
     assert "the wrong package" not in done.stderr

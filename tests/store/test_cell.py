@@ -31,7 +31,7 @@ from xrgs.splat.backend import resolve_backend
 from xrgs.store import cell
 from xrgs.store.cell_folder import CellFolder
 from xrgs.store.identity import cell_id, cell_identity
-from xrgs.sweep.jobs import worker
+from xrgs.sweep import job
 from xrgs.training import dataset
 from xrgs.training import loop as train
 from xrgs.training.dataset import Dataset
@@ -208,9 +208,9 @@ def test_a_worker_that_is_killed_goes_on_in_another(
     built = variant.load(frozen)
 
     folder = begin(conf, tmp_path / "killed", built.id)
-    write_json(tmp_path / "request.json", worker.cell_request(built.folder, folder))
+    write_json(tmp_path / "request.json", job.cell_request(built.folder, folder))
     files = [str(tmp_path / "request.json"), str(tmp_path / "answer.json")]
-    child = subprocess.Popen([sys.executable, "-P", "-m", "xrgs.sweep.jobs.worker", "cell", *files])
+    child = subprocess.Popen([sys.executable, "-P", "-m", "xrgs.sweep.job", "cell", *files])
     while not folder.checkpoint.exists() and child.poll() is None:
         time.sleep(0.005)
     time.sleep(random.uniform(0, 0.1))
@@ -219,7 +219,7 @@ def test_a_worker_that_is_killed_goes_on_in_another(
     folder.fail("its process was ended by SIGKILL")  # as the job does that started it
 
     folder = begin(conf, tmp_path / "killed", built.id)
-    worker.run_in_child("cell", worker.cell_request(built.folder, folder))
+    job.run_in_child("cell", job.cell_request(built.folder, folder))
     log = (folder.path / "log.txt").read_text()
     assert "going on from the checkpoint" in log
     spared = begin(conf, tmp_path / "spared", built.id)

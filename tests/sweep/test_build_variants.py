@@ -25,9 +25,8 @@ from xrgs.mixture.paths import TO_TRY
 from xrgs.safeio.atomic import write_json
 from xrgs.store import inspect
 from xrgs.store.store import Store, StoreGoneError
-from xrgs.sweep import build_variants
+from xrgs.sweep import build_variants, job
 from xrgs.sweep.build_variants import PlannedVariant
-from xrgs.sweep.jobs import worker
 from xrgs.sweep.status import describe, read
 
 BUILDING = "building the mixed-resolution variant"
@@ -59,7 +58,7 @@ def plan(conf: Conf, store: Store, *, allow_build: bool) -> PlannedVariant:
 
 
 def fail(*_: object) -> dict[str, Any]:
-    raise worker.WorkerError("SfM placed too few views")
+    raise job.WorkError("SfM placed too few views")
 
 
 def unexpected(*_: object) -> dict[str, Any]:
@@ -88,7 +87,7 @@ def test_a_frozen_variant_is_found_and_not_built(
     conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch, reported: PlannedVariant
 ) -> None:
     monkeypatch.setattr(variant, "find", lambda *_: SimpleNamespace(id="k-1"))
-    monkeypatch.setattr(worker, "run_in_child", unexpected)
+    monkeypatch.setattr(job, "run_in_child", unexpected)
     assert build_variants.find_or_build(conf, store) == "k-1"
     assert plan(conf, store, allow_build=True) == reported
 
@@ -115,11 +114,11 @@ def test_a_variant_that_the_store_lacks_is_built_in_a_child(
 ) -> None:
     requests = []
 
-    def build(job: str, request: dict[str, Any], *_: object) -> dict[str, Any]:
-        requests.append((job, request["conf"]["scene"]["kind"], request["store"]))
+    def build(work: str, request: dict[str, Any], *_: object) -> dict[str, Any]:
+        requests.append((work, request["conf"]["scene"]["kind"], request["store"]))
         return {"variant": "k-1"}
 
-    monkeypatch.setattr(worker, "run_in_child", build)
+    monkeypatch.setattr(job, "run_in_child", build)
     assert plan(conf, store, allow_build=False) == PlannedVariant()
     assert not requests
     assert plan(conf, store, allow_build=True) == reported
@@ -131,12 +130,12 @@ def test_a_scene_that_failed_is_not_tried_again_unless_asked(
     conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     remember_failure(conf, store)
-    monkeypatch.setattr(worker, "run_in_child", unexpected)
+    monkeypatch.setattr(job, "run_in_child", unexpected)
     failed_before = PlannedVariant(error="no first pair", remembered=True)
     assert plan(conf, store, allow_build=True) == failed_before
     conf.retry = "failed"
     assert plan(conf, store, allow_build=False) == PlannedVariant()
-    monkeypatch.setattr(worker, "run_in_child", fail)
+    monkeypatch.setattr(job, "run_in_child", fail)
     # The reason is the remembered one, so that the record of a repeated sweep is the same.
     assert plan(conf, store, allow_build=True) == failed_before
 
@@ -144,7 +143,7 @@ def test_a_scene_that_failed_is_not_tried_again_unless_asked(
 def test_a_failure_is_the_reason_in_the_plan_and_an_error_elsewhere(
     conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(worker, "run_in_child", fail)
+    monkeypatch.setattr(job, "run_in_child", fail)
     assert plan(conf, store, allow_build=True) == PlannedVariant(error="SfM placed too few views")
     with pytest.raises(XrgsError, match="SfM placed too few views"):
         build_variants.find_or_build(conf, store)
@@ -158,9 +157,9 @@ def test_a_library_that_dies_of_a_full_disk_is_not_a_failure_of_the_scene(
 
     def dies(*_: object) -> dict[str, Any]:
         monkeypatch.setattr(tempfile, "TemporaryFile", full)
-        raise worker.WorkerError("its process was ended by SIGABRT")
+        raise job.WorkError("its process was ended by SIGABRT")
 
-    monkeypatch.setattr(worker, "run_in_child", dies)
+    monkeypatch.setattr(job, "run_in_child", dies)
     with pytest.raises(StoreError, match="No space left"):
         plan(conf, store, allow_build=True)
 
@@ -169,9 +168,9 @@ def test_a_child_that_can_not_write_stops_the_sweep(
     conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def unwritable(*_: object) -> dict[str, Any]:
-        raise worker.UnwritableError("No space left on device")
+        raise job.WorkError("No space left on device", job.UNWRITABLE)
 
-    monkeypatch.setattr(worker, "run_in_child", unwritable)
+    monkeypatch.setattr(job, "run_in_child", unwritable)
     with pytest.raises(StoreError, match=r"No space left.*Finished cells are kept"):
         plan(conf, store, allow_build=True)
 
@@ -187,7 +186,7 @@ def test_a_variant_that_can_not_be_read_now_is_not_built_anew(
     frozen = store.variants / f"{variant.key(conf.scene, conf.variant)}-0123456789abcdef"
     frozen.mkdir()
     (frozen / "variant.json").write_text("{}")
-    monkeypatch.setattr(worker, "run_in_child", unexpected)
+    monkeypatch.setattr(job, "run_in_child", unexpected)
     sick("variant.json", number)
     found = plan(conf, store, allow_build=True)
     assert found == PlannedVariant(error=found.error)
@@ -202,7 +201,7 @@ def test_a_folder_of_variants_that_can_not_be_listed_is_named(
         raise OSError(errno.EACCES, os.strerror(errno.EACCES), str(path))
 
     monkeypatch.setattr(Path, "iterdir", fail)
-    monkeypatch.setattr(worker, "run_in_child", unexpected)
+    monkeypatch.setattr(job, "run_in_child", unexpected)
     assert "Permission denied" in str(plan(conf, store, allow_build=True).error)
 
 
@@ -217,9 +216,9 @@ def test_a_store_that_vanishes_while_a_variant_is_built_does_not_reappear(
         store.path.rename(store.path.with_name("moved"))
         if seen == "by its parent":
             on_poll(0)
-        raise worker.WorkerError("FileNotFoundError: no such file")
+        raise job.WorkError("FileNotFoundError: no such file")
 
-    monkeypatch.setattr(worker, "run_in_child", build)
+    monkeypatch.setattr(job, "run_in_child", build)
     with pytest.raises(StoreGoneError, match="no longer there"):
         plan(conf, store, allow_build=True)
     assert not store.path.exists()
@@ -245,7 +244,7 @@ def test_variants_are_built_at_once_on_shares_of_the_cores(
         return {"variant": f"k-{request['conf']['variant']['factor']}"}
 
     monkeypatch.setattr(build_variants, "usable_cores", lambda: 5)
-    monkeypatch.setattr(worker, "run_in_child", build)
+    monkeypatch.setattr(job, "run_in_child", build)
     planned = build_variants.plan(two(compose), store, allow_build=True)
     assert [found.id for found in planned] == ["k-2", "k-3"]
     assert environments == [{"PYTHON_CPU_COUNT": "2", "TQDM_DISABLE": "1"}] * 2
@@ -270,7 +269,7 @@ def test_as_many_are_built_at_once_as_there_is_room_for(
     monkeypatch.setattr(
         build_variants, "usable_memory", lambda: 1 if lacking == "memory" else 1 << 40
     )
-    monkeypatch.setattr(worker, "run_in_child", build)
+    monkeypatch.setattr(job, "run_in_child", build)
     planned = build_variants.plan(two(compose), store, allow_build=True)
     assert [found.id for found in planned] == ["k-1", "k-1"]
 
@@ -285,18 +284,18 @@ def test_a_build_that_stops_the_sweep_ends_the_others(
     ) -> dict[str, Any]:
         both.wait()
         if request["conf"]["variant"]["factor"] == 2:
-            raise worker.UnwritableError("No space left on device")
+            raise job.WorkError("No space left on device", job.UNWRITABLE)
         end = time.monotonic() + 30
         try:
             while time.monotonic() < end:
                 on_poll(0)
-        except worker.InterruptedWorkError:
+        except job.WorkError:
             ended.append(3)
             raise
         return {"variant": "k-3"}
 
     monkeypatch.setattr(build_variants, "usable_cores", lambda: 2)
-    monkeypatch.setattr(worker, "run_in_child", build)
+    monkeypatch.setattr(job, "run_in_child", build)
     with pytest.raises(StoreError, match="No space left"):
         build_variants.plan(two(compose), store, allow_build=True)
     assert ended == [3]
@@ -416,12 +415,12 @@ def test_photographs_of_which_too_few_are_trained_on_are_refused_before_sfm(
     compose: Callable[..., Conf], store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     conf = compose("scene=folder", f"scene.path={photographs(tmp_path / 'scene', 2)}")
-    monkeypatch.setattr(worker, "run_in_child", unexpected)
+    monkeypatch.setattr(job, "run_in_child", unexpected)
     planned = plan(conf, store, allow_build=True)
     assert "1 is held out to test on" in str(planned.error)
     assert "HR" not in str(planned.error)
     assert not planned.remembered
-    monkeypatch.setattr(worker, "run_in_child", fail)  # with every photograph, SfM is tried
+    monkeypatch.setattr(job, "run_in_child", fail)  # with every photograph, SfM is tried
     conf.variant.test_every = 0
     assert plan(conf, store, allow_build=True).error == "SfM placed too few views"
 
@@ -460,12 +459,12 @@ def test_images_are_made_again_of_trimmed_variants_alone(
     conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch, reported: PlannedVariant
 ) -> None:
     requests = []
-    monkeypatch.setattr(worker, "run_in_child", lambda *given: requests.append(given[:2]))
-    build_variants.restore(conf, store, "k-1")
+    monkeypatch.setattr(job, "run_in_child", lambda *given: requests.append(given[:2]))
+    job.restore_images(conf, store, "k-1")
     assert requests == []
     (store.variants / "trimmed-k-1").mkdir()
-    build_variants.restore(conf, store, "k-1")
-    ((job, request),) = requests
-    assert job == "restore"
+    job.restore_images(conf, store, "k-1")
+    ((work, request),) = requests
+    assert work == "restore"
     assert (request["variant"], request["store"]) == ("k-1", str(store.path))
     assert request["conf"]["scene"]["kind"] == "motorcycle"

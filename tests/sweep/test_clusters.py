@@ -30,7 +30,7 @@ import json, os, sys, time
 from pathlib import Path
 
 os.sched_getaffinity = lambda pid: {0, 1}
-if "xrgs.sweep.jobs.worker" in sys.orig_argv and "cell" in sys.orig_argv:
+if "xrgs.sweep.job" in sys.orig_argv and "cell" in sys.orig_argv:
     folder = Path(os.environ["SWEEPS_OF"])
     end = time.monotonic() + 240
     while len(list((folder / "s" / "cells").glob("*/log.txt"))) < 2:
@@ -49,7 +49,7 @@ RAY_SITE = """
 import os, sys, time
 from pathlib import Path
 
-if "xrgs.sweep.jobs.worker" in sys.orig_argv and "cell" in sys.orig_argv:
+if "xrgs.sweep.job" in sys.orig_argv and "cell" in sys.orig_argv:
     end = time.monotonic() + 240
     while len(list(Path({store!r}, "cells").glob("*/log.txt"))) < 2:
         if time.monotonic() > end:

@@ -32,7 +32,7 @@ def store(tmp_path: Path, cells: Any) -> Store:
 
 
 def chosen(store: Store, **of: object) -> list[str]:
-    return [cell.id for cell in Selection(**of).of(store.cell_rows())]  # type: ignore[arg-type]
+    return [cell.id for cell in Selection(**of).choose_from(store.cell_rows())]  # type: ignore[arg-type]
 
 
 def test_cells_are_chosen_by_name_state_age_and_size(store: Store) -> None:
@@ -96,7 +96,7 @@ def test_a_cell_is_shown_with_what_differs_from_its_baseline(store: Store, cells
     steps = replace(cells.conf.train, steps=7)
     cell = cells.done(train=steps)
     cells.record((cell.id, "fern", "fewer"), baseline_id="abc1")
-    (row,) = Selection(ids=(cell.id,)).of(store.cell_rows())
+    (row,) = Selection(ids=(cell.id,)).choose_from(store.cell_rows())
     lines = show(store, row).splitlines()
     assert lines[0] == f"cell {cell.id}  fern / fewer / seed 0"
     at = lines.index("differs from its baseline abc1 in:")
@@ -108,7 +108,7 @@ def test_a_cell_is_shown_with_what_differs_from_its_baseline(store: Store, cells
 def test_a_cell_without_a_baseline_says_so(store: Store, cells: Any) -> None:
     cell = cells.done()
     cells.record((cell.id, "fern", "plus"), baseline_id=None)
-    (row,) = Selection(ids=(cell.id,)).of(store.cell_rows())
+    (row,) = Selection(ids=(cell.id,)).choose_from(store.cell_rows())
     lines = show(store, row).splitlines()
     assert lines[lines.index("differs from its baseline in:") + 1] == (
         "  (no sweep names a baseline for it)"

@@ -23,12 +23,13 @@ from xrgs.runtime import lease
 from xrgs.store.attempts import begin_attempt
 from xrgs.store.identity import cell_id, cell_identity
 from xrgs.store.store import Store
-from xrgs.sweep import launch
+from xrgs.sweep import study
 from xrgs.sweep.axes import CellSpec
-from xrgs.sweep.jobs.job import INTERRUPTED
-from xrgs.sweep.launch import LOST, Launches, capacity, one_cell_a_gpu
+from xrgs.sweep.job import INTERRUPTED
+from xrgs.sweep.launchers import capacity, one_cell_a_gpu
 from xrgs.sweep.plan import PlannedCell
 from xrgs.sweep.session import SweepSession
+from xrgs.sweep.study import LOST, Launches
 
 
 @pytest.mark.parametrize(
@@ -287,7 +288,7 @@ def test_submitit_has_no_more_jobs_at_a_time_than_there_are_cores(
     launch_cells: Callable[..., tuple[dict[str, str], FakeLauncher]],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(launch, "usable_cores", lambda: 4)
+    monkeypatch.setattr(study, "usable_cores", lambda: 4)
     local = ("hydra/launcher=submitit_local", "hydra.launcher.cpus_per_task=2")
     _, fake = launch_cells("abcde", set(), *local)
     assert fake.launches == [["a", "b"], ["c", "d"], ["e"]]
@@ -310,7 +311,7 @@ def test_a_job_finds_its_folders_wherever_it_runs(
     cell, store = planned(conf, "a"), Store("s")
     monkeypatch.chdir(odd)
     store.prepare()
-    overrides = launch._hand_over(cell, 3, store)
+    overrides = study._hand_over(cell, 3, store)
     monkeypatch.chdir(odd.parent)
     assert overrides == [f"cell={cell.cell_id}", f"store={odd / 's'}", f"name={cell.name}"]
     given = Store(odd / "s").cell(str(cell.cell_id))
@@ -327,7 +328,7 @@ def test_a_number_of_threads_that_the_user_set_is_kept(
     compose: Callable[..., config.Conf], store: Store
 ) -> None:
     cell = planned(compose("threads=5"), "a")
-    launch._hand_over(cell, 3, store)
+    study._hand_over(cell, 3, store)
     assert store.cell(str(cell.cell_id)).config().threads == 5
 
 
@@ -351,7 +352,7 @@ def test_a_lease_that_the_plan_has_watched_long_enough_is_free_for_the_job(
     held = lease.acquire(store.leases, str(cell.cell_id))
     assert held is not None
     monkeypatch.setattr(lease.Owner, "lives", False)
-    launch._hand_over(cell, 1, store)
+    study._hand_over(cell, 1, store)
     assert not lease.names(store.leases)
 
 
@@ -360,14 +361,14 @@ def test_a_cell_that_another_sweep_has_begun_since_the_plan_is_left_as_it_is(
     compose: Callable[..., config.Conf], store: Store, how: str
 ) -> None:
     ours, theirs = (planned(compose(f"threads={n}"), "a") for n in (1, 2))
-    launch._hand_over(theirs, 1, store)
+    study._hand_over(theirs, 1, store)
     cell = store.cell(str(theirs.cell_id))
     begin_attempt(cell)
     if how == "done":
         finish(store, cell.id)
     else:
         assert lease.acquire(store.leases, cell.id) is not None
-    assert launch._hand_over(ours, 1, store)[0] == f"cell={cell.id}"
+    assert study._hand_over(ours, 1, store)[0] == f"cell={cell.id}"
     assert cell.config().threads == 2
     assert cell.state().name == ("done" if how == "done" else "unfinished")
 
@@ -397,7 +398,7 @@ def test_an_id_that_looks_like_a_number_stays_text(
     composed: Callable[..., DictConfig], session: SweepSession, name: str
 ) -> None:
     given = composed(*with_quotes([f"hydra.sweep.dir={session.folder}"]))
-    job = launch._JobConfigLoader().load_sweep_config(given, [f"cell={name}"])
+    job = study._JobConfigLoader().load_sweep_config(given, [f"cell={name}"])
     assert job.cell == name
 
 
@@ -408,4 +409,4 @@ def test_a_job_of_a_sweep_whose_folder_is_gone_does_not_begin(
     given = composed(*with_quotes([f"hydra.sweep.dir={session.folder}"]))
     session.folder.rename(session.folder.with_name("elsewhere"))
     with pytest.raises(XrgsError, match="is no longer there"):
-        launch._JobConfigLoader().load_sweep_config(given, ["cell=a"])
+        study._JobConfigLoader().load_sweep_config(given, ["cell=a"])

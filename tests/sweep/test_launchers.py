@@ -24,7 +24,7 @@ import os, sys, time
 from pathlib import Path
 
 os.sched_getaffinity = lambda pid: {0, 1}
-if "xrgs.sweep.jobs.worker" in sys.orig_argv and "cell" in sys.orig_argv:
+if "xrgs.sweep.job" in sys.orig_argv and "cell" in sys.orig_argv:
     folder = Path(os.environ["SWEEPS_OF"])
     end = time.monotonic() + 90
     while len(list((folder / "s" / "cells").glob("*/log.txt"))) < 2:

@@ -23,7 +23,7 @@ from xrgs.store.attempts import begin_attempt, plan_cell
 from xrgs.store.cell_folder import CellFolder
 from xrgs.store.identity import cell_id, cell_identity
 from xrgs.store.store import Store
-from xrgs.sweep.jobs import worker
+from xrgs.sweep import job
 from xrgs.sweep.rerun import RerunResult, rerun
 
 
@@ -66,8 +66,8 @@ def train(trained: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]
     """(file, old, new, ...) -> stand in for the training: what it gives has these changes."""
 
     def fake(*changes: tuple[str, str, str]) -> None:
-        def run(job: str, request: Mapping[str, Any]) -> dict[str, Any]:
-            assert job == "cell"
+        def run(work: str, request: Mapping[str, Any]) -> dict[str, Any]:
+            assert work == "cell"
             folder = CellFolder(Path(request["cell"]))
             for name in ("scores.csv", "history.csv", "splats.ply", "summary.json"):
                 shutil.copy(trained / name, folder.path)
@@ -77,7 +77,7 @@ def train(trained: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]
             folder.finish([], {})
             return {}
 
-        monkeypatch.setattr(worker, "run_in_child", run)
+        monkeypatch.setattr(job, "run_in_child", run)
 
     return fake
 
@@ -178,7 +178,7 @@ def test_other_code_libraries_and_machines_are_reported_before_the_training(
     def run(*_: object) -> None:
         raise XrgsError("not now")
 
-    monkeypatch.setattr(worker, "run_in_child", run)
+    monkeypatch.setattr(job, "run_in_child", run)
     with pytest.raises(XrgsError, match=r"not now \(.*log\.txt"):
         rerun(cell.path)
     err = capsys.readouterr().err
@@ -231,11 +231,11 @@ def test_a_missing_variant_is_built_and_has_to_be_the_same(
     other = f"{variant_id[:16] if same_key else '0' * 16}-{'1' * 16}"
     requests: list[Any] = []
 
-    def run(job: str, request: dict[str, Any], *_: object) -> dict[str, Any]:
-        requests.append((job, request["conf"]["scene"]["path"], request["store"]))
+    def run(work: str, request: dict[str, Any], *_: object) -> dict[str, Any]:
+        requests.append((work, request["conf"]["scene"]["path"], request["store"]))
         return {"variant": other}
 
-    monkeypatch.setattr(worker, "run_in_child", run)
+    monkeypatch.setattr(job, "run_in_child", run)
     with pytest.raises(XrgsError, match="COLMAP" if same_key else "its photographs, or the code"):
         rerun(cell.path, photographs=str(there))
     assert requests == [("variant", str(there), str(tmp_path / "s"))]

@@ -15,7 +15,7 @@ pytest.importorskip("submitit", reason="pip install 'xrgs[submitit]'")
 from submitit.slurm.slurm import SlurmJob
 
 from xrgs.sweep import submitit_jobs
-from xrgs.sweep.jobs.job import INTERRUPTED
+from xrgs.sweep.job import INTERRUPTED, WorkError
 
 
 @pytest.fixture
@@ -76,7 +76,7 @@ def test_each_job_has_its_own_answer_or_its_own_reason(
     assert cancelled.return_value == INTERRUPTED
     queue("5_1 NODE_FAIL\n")
     (lost,) = job.results()
-    with pytest.raises(submitit_jobs.JobLostError, match=r"job 5_1 \(NODE_FAIL\).*5_1_0_log.err"):
+    with pytest.raises(WorkError, match=r"job 5_1 \(NODE_FAIL\).*5_1_0_log.err"):
         _ = lost.return_value
     job.paths.result_pickle.write_bytes(pickle.dumps(("success", "an answer")))
     assert job.results() == ["an answer"]

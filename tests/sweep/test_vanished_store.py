@@ -18,7 +18,7 @@ from xrgs.store.store import Store, StoreGoneError
 #: Every cell's process reports that it has begun, and then writes into its folder for ever.
 WRITES_ON = """
 import sys
-if "xrgs.sweep.jobs.worker" in sys.orig_argv and "cell" in sys.orig_argv:
+if "xrgs.sweep.job" in sys.orig_argv and "cell" in sys.orig_argv:
     import os, time, types
     from pathlib import Path
 

@@ -63,7 +63,7 @@ def test_a_cell_is_found_by_its_scene_where_one_is_done(
     assert models.find_cell(str(store.cell("abd2").path), Store("gone")).id == "abd2"
     assert store.find_folder("garden") == store.cell("abc1").path
     rows = store.cell_rows()
-    assert [row.id for row in Selection(ids=("garden",)).of(rows)] == ["abc1"]
+    assert [row.id for row in Selection(ids=("garden",)).choose_from(rows)] == ["abc1"]
     for word in (sweep, sweep[:6], "my bike", "photos/garden"):
         assert store.find_sweep(word) == sweep
     with pytest.raises(StoreError, match=r"^house: no sweeps have such an id"):

@@ -1,4 +1,4 @@
-"""`xrgs-store`: lists, removes, packs, imports, scores anew and verifies what a store keeps."""
+"""`xrgs-store`: lists, removes, packs, imports, scores anew and verifies the items of a store."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Filter:
     def chosen(self) -> tuple[list[CellRow], list[CellRow]]:
         """Return all cells of the store, and the cells that are meant."""
         cells = Store(self.store).cell_rows()
-        return cells, self.selection().of(cells)
+        return cells, self.selection().choose_from(cells)
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ def show(cell: Positional[Annotated[str, arg(metavar="CELL")]], store: Folder = 
     from xrgs.store.listing import Selection
     from xrgs.sweep.inventory import show as described
 
-    (chosen,) = Selection(ids=(cell,)).of(Store(store).cell_rows())
+    (chosen,) = Selection(ids=(cell,)).choose_from(Store(store).cell_rows())
     say(described(Store(store), chosen))
 
 
@@ -229,24 +229,6 @@ def rescore(cells: Filter, also: Names = ()) -> None:
         sys.exit(1)
 
 
-def prove(cells: Filter, sample: Annotated[int, shown_as("N")] = 2) -> None:
-    """Prove that a refactoring changes no number, so that finished cells keep their ids.
-
-    Some done cells, which the code before the refactoring has trained, are trained again with the
-    installed code, and some variants are built again. If all bits are equal, the new code is
-    declared equal to the old one, in xrgs/safeio/refactorings.json of the installed package.
-
-    Args:
-        cells: The cells that pass all of these options.
-        sample: Number of cells or variants that are made again for each part of the code that has
-            changed.
-    """
-    from xrgs.sweep.refactoring import prove as proven
-
-    _, chosen = cells.chosen()
-    say(str(proven(Store(cells.store), [cell.folder for cell in chosen], sample)))
-
-
 def check(store: Folder = STORE) -> None:
     """Hash every file of the finished cells, the variants, the rendered scenes and the sweeps.
 
@@ -264,7 +246,7 @@ def check(store: Folder = STORE) -> None:
 
 
 def _say_left(lines: Sequence[str]) -> None:
-    """Say what was left, and why.
+    """Print the lines on things that were left, with the reasons.
 
     Raises:
         SystemExit: With code 1, where anything was.
@@ -298,7 +280,6 @@ def main() -> None:
         "import": import_,
         "gc": gc,
         "rescore": rescore,
-        "prove": prove,
         "check": check,
     }
     with exit_on_signal("What was not removed yet is unchanged."):

@@ -10,8 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import hydra
-from hydra.core.hydra_config import HydraConfig
-from hydra.errors import CompactHydraException
 from omegaconf import MISSING, DictConfig, OmegaConf
 
 from xrgs import config
@@ -42,7 +40,7 @@ Commas make axes, +ablation=[a,b] stacks. Finished cells are found in the store 
   seed=0,1    store=FOLDER    data_root=FOLDER    threads=N    dry_run=true
   limits.minutes=N  limits.memory_gb=N    end cells that exceed a limit, and count them as failed
   retry=failed      fail_fast=true        train failed cells again; stop after the first failure
-  baseline=false                          train the ablations alone
+  baseline=false                          train only the ablations
 
 xrgs-sweep rerun=CELL [out=FOLDER] [store=FOLDER] [threads=N] [scene.path=FOLDER]
            [plugins=NAME[,NAME]...]
@@ -84,26 +82,6 @@ class RerunConf:
     """Names of components of other packages that the cell may import, separated by commas."""
 
 
-@hydra.main(version_base="1.3", config_path=str(config.CONF_DIR), config_name="config")
-def _run_job(cfg: DictConfig) -> str:
-    """Run one job; Hydra's launcher calls this, while Hydra's sweeper plans and launches."""
-    if "cell" not in cfg:
-        raise CompactHydraException("hydra.mode must be MULTIRUN, as conf/config.yaml sets it")
-    from xrgs.store.store import Store
-    from xrgs.sweep.jobs.job import INTERRUPTED, run_job
-    from xrgs.sweep.session import SweepSession
-
-    hydra_conf: Any = HydraConfig.get()
-    brief = OmegaConf.select(hydra_conf, "sweeper.brief", default=False)
-    session = SweepSession(Path(hydra_conf.sweep.dir), brief)
-    outcome = run_job(session, Store(Path(cfg.store)), cfg.cell, cfg.name)
-    if session.owner_dead:  # a worker of joblib would wait for ever to hand over its answer
-        os._exit(os.EX_TEMPFAIL)
-    if outcome == INTERRUPTED and os.environ.get("SUBMITIT_EXECUTOR") == "slurm":
-        sys.exit(os.EX_TEMPFAIL)  # no answer yet: SLURM may be about to run this job again
-    return outcome
-
-
 def main() -> None:
     """Run `xrgs-sweep [+ablation=NAME] [KEY=VALUE[,VALUE]...]...`."""
     guard_streams()
@@ -139,15 +117,20 @@ def run(command: str, words: Sequence[str], hint: str) -> None:
     Args:
         command: Name of the command, which begins messages.
         words: The arguments of `xrgs-sweep`.
-        hint: What is said where a signal ends it: what is kept, and how to continue.
+        hint: A text for the end by a signal: what is kept, and how to continue.
 
     Raises:
         SystemExit: With code 1 where a cell failed; with a message where the user can correct the
             problem.
     """
     with exit_on_signal(hint), _hydra_errors(command):
+        from xrgs.sweep.job import run_hydra_job  # slow to load: not for --help and help=
+
         sys.argv[1:] = with_options_first(with_quotes(words))
-        _run_job()
+        configured = hydra.main(
+            version_base="1.3", config_path=str(config.CONF_DIR), config_name="config"
+        )
+        configured(run_hydra_job)()
 
 
 @contextmanager

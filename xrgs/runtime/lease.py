@@ -42,9 +42,9 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-#: Seconds between two heartbeats, and seconds without one after which an owner on another machine
-#: is dead.
+#: Seconds between two heartbeats.
 BEAT_S = 30.0
+#: An owner on another machine is dead after this many seconds without a heartbeat.
 SILENT_S = 600.0
 #: Seconds between two tries of `waited_for`.
 _POLL_S = 0.5
@@ -66,10 +66,10 @@ class Owner(msgspec.Struct, frozen=True):
 
     host: str
     boot: str
-    """Id of the machine's boot and process namespace; process ids are valid within both."""
+    """Id of the machine's boot and process namespace. A process id is unique only within both."""
     pid: int
     started: float
-    """Seconds from the boot to the start of the process: process ids are given again."""
+    """Seconds from the boot to the start of the process: a later process may have the same id."""
 
     @property
     def lives(self) -> bool:
@@ -78,7 +78,7 @@ class Owner(msgspec.Struct, frozen=True):
 
     @property
     def here(self) -> bool:
-        """Whether the process would run on this machine, boot and process namespace."""
+        """Whether the process belongs to this machine, its present boot and process namespace."""
         return (self.host, self.boot) == (socket.gethostname(), processes.boot())
 
     def __str__(self) -> str:
@@ -92,8 +92,8 @@ class Lease:
         """Start the heartbeats of a lease's file that `sign` has just created."""
         self.path, self.owner = path, owner
         self.lost = False
-        """Whether another process has taken over: this process was suspended, or cut off from the
-        file server, for too long. The cell's files are the other one's then."""
+        """Whether another process has taken over, because this one was suspended, or cut off from
+        the file server, for too long. The cell's files then belong to the other process."""
         self._ended = threading.Event()
         threading.Thread(target=self._keep_beating, name="xrgs-lease", daemon=True).start()
 
@@ -103,7 +103,7 @@ class Lease:
 
     def beat(self) -> bool:
         """Give a heartbeat; return False if the lease is lost."""
-        # Where the file server is out of reach now, a later heartbeat decides.
+        # While the file server is out of reach, nothing is decided: a later heartbeat tells.
         with suppress(OSError):
             try:
                 mine = _parse(read_bytes(self.path, _MAX_BYTES)) == self.owner
@@ -164,11 +164,11 @@ def waited_for(folder: Path, name: str) -> Iterator[Lease]:
     Raises:
         OSError: The folder of the leases can't be read or written.
     """
-    said = False
+    warned = False
     while (lease := acquire(folder, name)) is None:
-        if not said:
+        if not warned:
             _log.warning("%s: waiting until another process has finished", folder / name)
-            said = True
+            warned = True
         time.sleep(_POLL_S)
     try:
         yield lease

@@ -22,8 +22,8 @@ def usable_cores() -> int:
     counts: list[float] = [os.cpu_count() or 1, cpu_quota()]
     if hasattr(os, "sched_getaffinity"):
         counts.append(len(os.sched_getaffinity(0)))
-    if (given := os.environ.get("PYTHON_CPU_COUNT", "")).isdecimal():
-        counts.append(int(given))
+    if (count := os.environ.get("PYTHON_CPU_COUNT", "")).isdecimal():
+        counts.append(int(count))
     return max(1, math.ceil(min(counts)))
 
 
@@ -71,16 +71,16 @@ def _control_groups(root: Path, controller: str) -> Iterator[Path]:
     except OSError:  # not Linux
         return
     for line in lines:
-        _, controllers, own = line.split(":", 2)
+        _, controllers, path = line.split(":", 2)
         if not controllers:
             mounts = ("", "unified")
         elif controller in controllers.split(","):
             mounts = (controllers, controller)
         else:
             continue
-        # In a container the group may have the path that it has outside: then no folder but the
-        # mount itself is there, and is the container's group.
-        for group in (PurePosixPath(own), *PurePosixPath(own).parents):
+        # In a container the path may be that of outside. Then only the mount itself is there: it is
+        # the container's group.
+        for group in (PurePosixPath(path), *PurePosixPath(path).parents):
             for mount in mounts:
                 yield root / "sys/fs/cgroup" / mount / group.relative_to("/")
 
@@ -99,13 +99,14 @@ def peak_rss() -> int:
 
 
 def set_portable_blas(cpuinfo: Path = Path("/proc/cpuinfo")) -> None:
-    """Make OpenBLAS of child processes, in numpy and pycolmap, compute with AVX2 where there is.
+    """Make OpenBLAS in child processes (numpy's, pycolmap's) use AVX2 where the processor has it.
 
     OpenBLAS has other kernels for processors with AVX-512, whose last digits differ. A value of
     OPENBLAS_CORETYPE that is already in the environment is kept.
 
     Args:
-        cpuinfo: Linux's list of what each processor can do. Other systems have none, and are left.
+        cpuinfo: The file in which Linux lists the features of processors. On systems without it
+            nothing is set.
     """
     if {"avx2", "fma"} <= set(_words(cpuinfo)):
         os.environ.setdefault("OPENBLAS_CORETYPE", "Haswell")
@@ -132,7 +133,7 @@ def set_torch_threads(threads: int) -> int:
 
 
 def wait_for_gpu() -> None:
-    """Wait until a GPU has done what this process has asked of it, if it has; for clocks."""
+    """Wait until the GPU, where one is used, has finished this process's work: for timing."""
     import torch
 
     if torch.cuda.is_initialized():  # type: ignore[no-untyped-call]
@@ -140,7 +141,7 @@ def wait_for_gpu() -> None:
 
 
 def gpus() -> list[str]:
-    """Return the GPUs of NVIDIA that this process may use, as CUDA_VISIBLE_DEVICES names them."""
+    """Return the NVIDIA GPUs that this process may use, as CUDA_VISIBLE_DEVICES names them."""
     visible = os.environ.get("CUDA_VISIBLE_DEVICES")
     if visible is not None:
         names = [name.strip() for name in visible.split(",")]

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import psutil
 
-#: Seconds that two readings of one start may differ: boot times are rounded, and move with the
-#: clock. A process id is not given again so soon.
+#: Two readings of a process's start may differ by less than this many seconds: boot times are
+#: rounded, and move with the clock. No later process has the same id so soon.
 _START_S = 2.0
 
 

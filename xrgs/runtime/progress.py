@@ -33,13 +33,13 @@ else:
 
 _T = TypeVar("_T")
 
-#: Seconds between two updates of a bar, of the file, and between two lines of a log.
+#: Seconds between two updates: of a bar, of the file, and of a log.
 _BAR_S, _FILE_S, _LINE_S = 0.5, 2.0, 60.0
 #: Seconds before a bar appears, so that short work shows none.
 _BAR_DELAY_S = 2.0
 #: The largest progress file that is read, in bytes.
 _MAX_BYTES = 1 << 12
-#: The most characters of a bar's words that are shown.
+#: The most characters that are shown of the name of a piece of work, its unit or its note.
 _MAX_WORD = 80
 _Count = Annotated[int, msgspec.Meta(ge=0, lt=1 << 53)]
 
@@ -50,7 +50,7 @@ class ProgressFile:
 
     path: Path
     note: str = ""
-    """More on the work, shown with the next count."""
+    """A remark on the work, shown with the next count."""
 
 
 _file: ContextVar[ProgressFile | None] = ContextVar("file", default=None)
@@ -69,7 +69,7 @@ class Progress(msgspec.Struct, frozen=True):
     rate: Annotated[float, msgspec.Meta(gt=1e-15, lt=1e15)] | None
     """Recent units per second; None if not known yet."""
     note: str = ""
-    """More on the work, for example `84,000 Gaussians, loss 0.041`."""
+    """A remark on the work, for example `84,000 Gaussians, loss 0.041`."""
 
     @property
     def remaining_s(self) -> float | None:
@@ -79,9 +79,9 @@ class Progress(msgspec.Struct, frozen=True):
     @property
     def count(self) -> str:
         """A phrase such as `training 1,200 of 3,000 steps`, with the note."""
-        of = "" if self.total is None else f" of {self.total:,}"
+        total = "" if self.total is None else f" of {self.total:,}"
         what, unit, note = (for_line(text, _MAX_WORD) for text in (self.what, self.unit, self.note))
-        return f"{what} {self.done:,}{of} {unit}s" + (note and f", {note}")
+        return f"{what} {self.done:,}{total} {unit}s" + (note and f", {note}")
 
     def __str__(self) -> str:
         parts = [self.count]
@@ -143,11 +143,11 @@ class ProgressBar(_Tqdm):
         if msg is None:
             total = None if self.total is None else int(self.total)
             note = "" if self._file is None else self._file.note
-            now = Progress(self.desc, self.unit, int(self.n), total, self._rate(), note)
+            state = Progress(self.desc, self.unit, int(self.n), total, self._rate(), note)
             if self._file is None:
-                log_line(str(now))
+                log_line(str(state))
             else:
-                _write(self._file.path, now)
+                _write(self._file.path, state)
         return None
 
     def _rate(self) -> float | None:
@@ -165,10 +165,10 @@ def progress(
     return iter(ProgressBar(what, unit, total, items=items, done=done))
 
 
-def _write(file: Path, now: Progress) -> None:
+def _write(file: Path, state: Progress) -> None:
     # Progress is not a result: nothing is lost when it can't be written.
     with suppress(OSError):
-        write_json(file, msgspec.structs.asdict(now), durable=False)
+        write_json(file, msgspec.structs.asdict(state), durable=False)
 
 
 @contextmanager

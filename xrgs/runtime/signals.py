@@ -32,7 +32,7 @@ def exit_on_signal(hint: str) -> Iterator[None]:
     shell's `&`) stays ignored.
 
     Args:
-        hint: Printed after the name of the signal: what is kept, and how to continue.
+        hint: A text that is printed after the name of the signal: what is kept, and how to go on.
 
     Raises:
         SystemExit: A signal arrived; the exit code is 128 plus its number, as shells report it.
@@ -47,8 +47,8 @@ def exit_on_signal(hint: str) -> Iterator[None]:
         sys.exit(128 + stop.number)
 
 
-#: Signals that a library may take for its report of a crash, as COLMAP's does.
-_OF_CRASHES = (
+#: Signals for which a library may install a handler that reports crashes, as COLMAP's does.
+_CRASH_SIGNALS = (
     *(signal.SIGABRT, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGSEGV),
     signal.SIGTERM,
 )
@@ -58,12 +58,12 @@ _SIGACTION_BYTES = 512
 
 @contextmanager
 def handlers_kept() -> Iterator[None]:
-    """Give the handlers of signals back that a library takes during a block, Python's or not.
+    """Restore, after a block, the signal handlers that a library replaces in it.
 
-    SIGTERM waits meanwhile: the library's handler prints a stack.
+    SIGTERM is blocked meanwhile, since the library's handler would print a stack.
     """
     libc = ctypes.CDLL(None)
-    before = {number: ctypes.create_string_buffer(_SIGACTION_BYTES) for number in _OF_CRASHES}
+    before = {number: ctypes.create_string_buffer(_SIGACTION_BYTES) for number in _CRASH_SIGNALS}
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
     for number, action in before.items():
         libc.sigaction(number, None, action)
@@ -84,12 +84,12 @@ class StopRequest:
         self._is_deferred = False
 
     def watch(self) -> None:
-        """Raise `StopSignal` at SIGTERM from now on, in place of ending this process."""
+        """From now on, raise `StopSignal` at SIGTERM instead of ending this process."""
         signal.signal(signal.SIGTERM, self._on_signal)
 
     @contextmanager
     def deferred(self) -> Iterator[None]:
-        """Let the signal raise nothing during a block, which looks at `received` itself."""
+        """During a block, which reads `received` itself, raise nothing at the signal."""
         self._is_deferred = True
         try:
             yield

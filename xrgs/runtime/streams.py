@@ -109,7 +109,7 @@ def guard_streams() -> None:
         sys.stdin = io.TextIOWrapper(io.BufferedReader(io.FileIO(0, closefd=False)))
     for descriptor, name in ((1, "stdout"), (2, "stderr")):
         stream = getattr(sys, name)
-        # A stream that something else has put in the place of Python's own is left alone.
+        # A stream that other code has put in the place of Python's own stays.
         if stream is getattr(sys, f"__{name}__"):
             encoding = "utf-8" if stream is None else stream.encoding
             setattr(sys, name, _without_write_errors(descriptor, encoding))

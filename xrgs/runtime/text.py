@@ -70,7 +70,7 @@ class TextTable:
     name: str = ""
     """The text of LaTeX's label; the title where it is empty."""
     spans: tuple[tuple[str, int], ...] = ()
-    """Headings over the columns, from the left, with how many each is over; empty for none."""
+    """Headings over groups of columns, from the left, each with its number of columns."""
     best: frozenset[tuple[int, int]] = frozenset()
     """Row and column of the cells that Markdown and LaTeX print bold."""
     prose: bool = False
@@ -78,12 +78,12 @@ class TextTable:
 
     @property
     def heads(self) -> tuple[str, ...]:
-        """The heads of the columns, each after the heading over it."""
+        """The heads of the columns, each after the heading of its group."""
         if not self.spans:
             return self.columns
         above = [head for head, columns in self.spans for _ in range(columns)]
         pairs = zip(above, self.columns, strict=True)
-        return tuple(f"{head} {own}".strip() for head, own in pairs)
+        return tuple(f"{heading} {column}".strip() for heading, column in pairs)
 
 
 def to_text(table: TextTable) -> str:
@@ -99,15 +99,15 @@ def to_text(table: TextTable) -> str:
 
 
 def _wrapped(rows: Sequence[tuple[str, ...]]) -> list[tuple[str, ...]]:
-    """Return rows whose last text is wrapped to rows below it, so that no line is too long."""
+    """Wrap the last text of each row into rows below it, so that no line is too long."""
     *columns, _ = zip(*rows, strict=True)
     room = _MAX_WIDTH - sum(max(3, *map(width, column)) + 2 for column in columns)
-    found = []
+    wrapped = []
     for *others, text in rows:
         first, *more = wrap(text, room) or [""]
-        found.append((*others, first))
-        found += [(*[""] * len(others), line) for line in more]
-    return found
+        wrapped.append((*others, first))
+        wrapped += [(*[""] * len(others), line) for line in more]
+    return wrapped
 
 
 def one_line(row: Sequence[str]) -> tuple[str, ...]:

@@ -1,1 +1,1 @@
-"""Reads and writes files: typed, bounded and atomic; makes texts safe for their outputs."""
+"""Reads and writes files: typed, bounded and atomic; makes texts safe to show."""

@@ -1,4 +1,4 @@
-"""Digests of source code by its meaning: comments, docstrings and blank lines do not count.
+"""Computes digests of source code in which comments, docstrings and blank lines do not count.
 
 The digest is of text and not of a syntax tree, whose dump differs between versions of Python: the
 spans that `ast` and `tokenize` find are cut out of the text, and blank lines are dropped.
@@ -24,11 +24,11 @@ if TYPE_CHECKING:
 PACKAGE = Path(__file__).parents[1]
 _NAME = "xrgs"
 _SUFFIXES = frozenset({".py", ".cpp", ".h", ".txt"})
-#: Modules that define types alone: an import from them changes no result.
+#: Modules that define only types: an import from them changes no result.
 _TYPING = frozenset({"__future__", "typing", "typing_extensions", "collections.abc", "_typeshed"})
 _TYPING |= {"numpy.typing"}
-#: Strings, raw strings and character literals of C++, which may hold what looks like a comment, and
-#: comments. A raw string ends with the delimiter that it begins with.
+#: Comments of C++, and the strings, raw strings and character literals that may contain text like a
+#: comment. A raw string ends with the delimiter that it begins with.
 _CPP = re.compile(
     r'R"(?P<mark>[^(]*)\(.*?\)(?P=mark)"'
     r"|\"(?:\\.|[^\"\\\n])*\"|(?<![0-9A-Fa-f])'(?:\\.|[^'\\\n])*'"  # but for the ' of 1'000
@@ -41,23 +41,23 @@ _CMAKE = re.compile(r'"(?:\\.|[^"\\])*"|(?P<comment>#[^\n]*)', re.DOTALL)
 
 @dataclass(frozen=True)
 class CodeFolders:
-    """Folders whose code decides numbers. It counts always, but for the parts, which are switched.
+    """Folders whose code decides numbers: a core that counts always, and parts that can be off.
 
-    A file that only parts import counts with each of them. A file of `folders_of_parts` that
-    nothing imports is no part, and counts for nothing. Files and folders are relative to the
-    package.
+    A file that only parts import counts with each of them. A file of `folders_of_parts` that is no
+    part and that nothing imports never counts. Files and folders are relative to the package.
     """
 
     folders: tuple[str, ...]
     """The folders."""
     whole_parts: tuple[str, ...]
-    """Folders below them that are left to the caller: each is a part, or counts for nothing."""
+    """Folders below these that the core leaves out. The caller takes each as a part, or not at
+    all."""
     folders_of_parts: tuple[str, ...]
-    """Folders below them of which each file is a part, or what a part or the core imports."""
+    """Folders below these in which each file is a part, or is imported by a part or the core."""
     parts: frozenset[str]
     """The files of the parts in these folders."""
     registries: frozenset[str] = frozenset()
-    """Files that import the parts to list them. They count for nothing."""
+    """Files that import the parts to list them. They never count."""
 
     def core(self) -> tuple[str, ...]:
         """Return the files that count always, sorted."""
@@ -67,12 +67,12 @@ class CodeFolders:
         return tuple(sorted(self._with_imports(files, self.parts) - self.registries))
 
     def part(self, file: str) -> tuple[str, ...]:
-        """Return the file of a part and those that it needs of `folders_of_parts`, sorted."""
+        """Return the file of a part, and the files of `folders_of_parts` that it needs, sorted."""
         others = {*self.core(), *self.registries}
         return tuple(sorted(self._with_imports({file}, others)))
 
     def needed_by(self, files: Iterable[Path]) -> dict[str, Path]:
-        """Return the parts that source files import, with what these need, by their names.
+        """Return the parts that source files import, and the files that these need, by name.
 
         Args:
             files: Files that need not be of this package.
@@ -83,14 +83,14 @@ class CodeFolders:
         return {name: PACKAGE / name for name in self._with_imports(parts, core | self.registries)}
 
     def _with_imports(self, files: set[str], end: Iterable[str]) -> set[str]:
-        """Add what files import of `folders_of_parts`, and what that imports, up to an end."""
+        """Add all files of `folders_of_parts` that files import, but for those of `end`."""
         files, pending = set(files), list(files)
         while pending:
-            found = {
+            imported = {
                 n for n in _imported(PACKAGE / pending.pop()) if _is_in(n, self.folders_of_parts)
             }
-            pending += found - files - {*end}
-            files |= found - {*end}
+            pending += imported - files - {*end}
+            files |= imported - {*end}
         return files
 
 
@@ -103,7 +103,7 @@ def _is_in(name: str, folders: Iterable[str]) -> bool:
 
 
 def _imported(file: Path) -> set[str]:
-    """Return the files of this package that a file imports, for types alone too."""
+    """Return the files of this package that a file imports, if only for types."""
     if file.suffix != ".py":
         return set()
     imported = {_file_of(dotted) for dotted in _own_imports(file, file.stat().st_mtime_ns)}
@@ -149,20 +149,20 @@ def sources(*names: str) -> list[Path]:
     Raises:
         XrgsError: There is no such file or folder.
     """
-    found: set[Path] = set()
+    files: set[Path] = set()
     for name in names:
         path = PACKAGE / name
         if not path.exists():
             raise XrgsError(f"{path}: this source file is missing; install xrgs again")
-        found.update(path.rglob("*") if path.is_dir() else [path])
-    return sorted(file for file in found if file.suffix in _SUFFIXES)
+        files.update(path.rglob("*") if path.is_dir() else [path])
+    return sorted(file for file in files if file.suffix in _SUFFIXES)
 
 
 def digest_files(files: dict[str, Path]) -> str:
     """Return a digest of source files, 16 hexadecimal digits.
 
     Args:
-        files: The files by the names that count for the digest.
+        files: The files by their names, which count for the digest too.
     """
     sha256 = hashlib.sha256()
     for name, file in sorted(files.items()):
@@ -181,7 +181,7 @@ def _meaning_of(file: Path, _modified_ns: int) -> str:
 
 
 def meaning(text: str, suffix: str) -> str:
-    """Return source code without what does not change its results.
+    """Return source code without the text that changes no result.
 
     Args:
         text: The source code.
@@ -196,12 +196,12 @@ def meaning(text: str, suffix: str) -> str:
     return "\n".join(line for line in map(str.rstrip, text.splitlines()) if line.strip())
 
 
+#: Start and end of a part of a text: lines from 1, columns from 0.
 _Span = tuple[tuple[int, int], tuple[int, int]]
-"""Start and end of a part of a text: lines from 1, columns from 0."""
 
 
 def _python_spans(text: str) -> list[_Span]:
-    """Return the parts of Python code that change no result, in characters."""
+    """Find comments, docstrings and type-only imports; columns are in characters."""
     lines = text.splitlines(keepends=True)
 
     def span(node: ast.stmt) -> _Span:
@@ -219,7 +219,7 @@ def _python_spans(text: str) -> list[_Span]:
 
 
 def _is_idle(node: ast.stmt) -> bool:
-    """Return whether a statement is a docstring, or an import or a block for types alone."""
+    """Return whether a statement is a docstring, or a type-only import or block."""
     match node:
         case ast.Expr(value=ast.Constant(value=str())):  # docstrings of attributes too
             return True
@@ -238,6 +238,6 @@ def _cut(text: str, spans: list[_Span]) -> str:
             line = lines[number].rstrip("\n")
             left = start if number == first - 1 else 0
             right = end if number == last - 1 else len(line)
-            # Columns stay what they are for other parts of the same line.
+            # Blanks keep the columns of other parts of the same line.
             lines[number] = line[:left] + " " * (right - left) + line[right:] + "\n"
     return "".join(lines)

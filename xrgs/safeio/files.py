@@ -1,6 +1,6 @@
-"""What `pathlib` lacks: bounded reads, walks, removal of whatever is there, and fsync.
+"""File operations that `pathlib` lacks: bounded reads, walks, removal of any path, and fsync.
 
-A store is its owner's: paths in it are plain `Path`s, and links in it are followed. What comes from
+A store belongs to its user: paths in it are plain `Path`s, and links in it are followed. A store of
 somebody else is checked once, by `xrgs-store import`.
 """
 
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
 #: The largest file that is read whole, in bytes. A sweep's record of ten thousand cells has 3 MB.
 MAX_BYTES = 1 << 26
-#: Errors about what a path leads to. All others may be gone at the next try: permissions, a disk or
-#: a server that fails, too many open files.
+#: Errors that another try gives again: the path leads to nothing, or to another kind of thing. All
+#: others may be gone then: permissions, a disk or a server that fails, too many open files.
 _CONCLUSIVE = frozenset(
     {
         errno.ENOENT,
@@ -86,8 +86,8 @@ def walk_files(folder: Path) -> Iterator[tuple[str, os.stat_result]]:
 
 def file_bytes(path: Path) -> int:
     """Return the bytes of the regular files at a path and below."""
-    found = [status for _, status in walk_files(path)] if path.is_dir() else [path.lstat()]
-    return sum(status.st_size for status in found if stat.S_ISREG(status.st_mode))
+    statuses = [status for _, status in walk_files(path)] if path.is_dir() else [path.lstat()]
+    return sum(status.st_size for status in statuses if stat.S_ISREG(status.st_mode))
 
 
 def read_bytes(path: Path, max_bytes: int = MAX_BYTES) -> bytes:
@@ -107,7 +107,7 @@ def read_bytes(path: Path, max_bytes: int = MAX_BYTES) -> bytes:
             why = f"{status.st_size} bytes, at most {max_bytes} are read"
             raise OSError(errno.EFBIG, why, str(path))
         with open(descriptor, "rb", closefd=False) as stream:
-            return stream.read(status.st_size)  # a bound alone would take memory for all of it
+            return stream.read(status.st_size)  # `max_bytes` would allocate all of it
     finally:
         os.close(descriptor)
 
@@ -134,7 +134,7 @@ def sync_name(path: Path) -> None:
 def sync_tree(folder: Path) -> None:
     """Wait until all files below a folder are on the disk, with their names.
 
-    The name of the folder itself is not waited for, see `sync_name`.
+    The name of the folder itself takes `sync_name`.
     """
     folders = {folder}
     for name, status in walk_files(folder):

@@ -13,7 +13,7 @@ _CHUNK = 1 << 16  # bytes
 
 
 def canonical_json(value: object) -> str:
-    """Return one line of JSON, the same for equal values: keys are sorted, there are no spaces."""
+    """Return one line of JSON with sorted keys and without spaces: equal values give equal text."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
 
 

@@ -1,7 +1,7 @@
 """Reads the vertices of a .ply file: ASCII or binary, any properties, among any other elements.
 
-The file may come from anybody. Nothing is allocated for what the header declares before the size of
-the file shows that it is there.
+The file may come from anybody. No memory is allocated for declared data before the size of the file
+shows that the data is there.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _OLD_END = re.compile(rb"\rend_header[ \t]*\r")
 
 @dataclass(frozen=True)
 class Ply:
-    """What a .ply file says of its vertices."""
+    """The vertices of a .ply file, and its comments."""
 
     vertices: NDArray[np.void]
     """[V] with a field for each property of the element `vertex` that is not a list, in the file's
@@ -89,11 +89,12 @@ class _Element:
 
     @property
     def has_lists(self) -> bool:
-        return any(of.length for of in self.properties)
+        return any(prop.length for prop in self.properties)
 
     def record(self, order: str) -> np.dtype[np.void]:
         """Return the type of the properties that are no lists."""
-        return np.dtype([(of.name, order + of.kind) for of in self.properties if not of.length])
+        scalars = [prop for prop in self.properties if not prop.length]
+        return np.dtype([(prop.name, order + prop.kind) for prop in scalars])
 
 
 def read(path: Path) -> Ply:
@@ -142,8 +143,8 @@ def _parse_header(lines: Iterable[str]) -> tuple[str, list[_Element], tuple[str,
         match line.split():
             case ["comment" | "obj_info", *_]:
                 comments.append(" ".join(line.split(maxsplit=1)[1:]).rstrip())
-            case ["format", known, "1.0"] if known in _BYTE_ORDERS and not form:
-                form = known
+            case ["format", name, "1.0"] if name in _BYTE_ORDERS and not form:
+                form = name
             case ["element", name, count] if re.fullmatch("[0-9]{1,12}", count):
                 elements.append(_Element(name, int(count)))
             case ["property", "list", length, kind, name] if (
@@ -166,10 +167,10 @@ def _up_to_vertices(elements: list[_Element]) -> tuple[list[_Element], _Element]
         has = ", ".join(names)[:80] or "none"
         raise ValueError(f"the .ply header must have one element vertex, its elements are: {has}")
     at = names.index("vertex")
-    properties = [of.name for of in elements[at].properties]
+    properties = [prop.name for prop in elements[at].properties]
     if len(set(properties)) != len(properties):
         raise ValueError("the .ply header names a property of vertex twice")
-    if all(of.length for of in elements[at].properties):
+    if all(prop.length for prop in elements[at].properties):
         raise ValueError("the .ply header names no properties of vertex")
     return elements[:at], elements[at]
 
@@ -193,11 +194,11 @@ def _read_binary(
 
 def _checked_bytes(file: BinaryIO, element: _Element, size: int) -> int:
     """Return the number of bytes of an element without lists, which must be in the file."""
-    needed, left = element.count * element.record("=").itemsize, size - file.tell()
-    if needed > left:
+    needed, remaining = element.count * element.record("=").itemsize, size - file.tell()
+    if needed > remaining:
         raise ValueError(
             f"its {element.count} rows of the element {element.name} need {needed} bytes, "
-            f"{left} are left in the file"
+            f"{remaining} are left in the file"
         )
     return needed
 
@@ -205,12 +206,12 @@ def _checked_bytes(file: BinaryIO, element: _Element, size: int) -> int:
 def _rows_without_lists(file: BinaryIO, element: _Element, order: str) -> Iterator[bytes]:
     """Yield the bytes of each row without its lists; each row must have one list at least."""
     runs, scalars = [], 0  # bytes of the properties before a list, the bytes of its length, ...
-    for of in element.properties:
-        if of.length:
-            runs.append((scalars, int(of.length[1]), of.length[0] == "i", int(of.kind[1])))
+    for prop in element.properties:
+        if prop.length:
+            runs.append((scalars, int(prop.length[1]), prop.length[0] == "i", int(prop.kind[1])))
             scalars = 0
         else:
-            scalars += int(of.kind[1])
+            scalars += int(prop.kind[1])
     byte_order: Literal["big", "little"] = "big" if order == ">" else "little"
     for _ in range(element.count):
         row = b""
@@ -253,14 +254,14 @@ def _read_ascii(file: BinaryIO, before: list[_Element], vertex: _Element) -> NDA
 def _line_without_lists(element: _Element, line: str) -> str:
     words, kept = iter(line.split()), []
     try:
-        for of in element.properties:
-            if of.length:
+        for prop in element.properties:
+            if prop.length:
                 deque(islice(words, int(next(words))), maxlen=0)
             else:
                 kept.append(next(words))
     except StopIteration:
         raise ValueError(f"a line of the element {element.name} is too short") from None
-    return " ".join([*kept, *words])  # words that are left are too many: they are found as such
+    return " ".join([*kept, *words])  # the caller counts, and so refuses superfluous words
 
 
 def _typed(values: NDArray[np.float64], record: np.dtype[np.void]) -> NDArray[np.void]:

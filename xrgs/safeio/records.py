@@ -1,4 +1,4 @@
-"""Reads the JSON and CSV files of a store: each decoded in one place, by its declared type."""
+"""Reads the JSON and CSV files of a store, each decoded by its declared type."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ MAX_BYTES = 1 << 22
 MAX_NUMBER = 1e30
 #: The most rows and columns of a table. A cell's scores have a row for each test view.
 _MAX_ROWS, _MAX_COLUMNS = 20_000, 1000
-#: What msgspec says of a text that does not match its pattern. Only names and paths have patterns.
+#: msgspec's message for a text that does not match its pattern. Only names and paths have one.
 _PATTERN = re.compile(r"Expected `str` matching regex .*")
 
 

@@ -1,4 +1,4 @@
-"""Makes texts of others safe for an output: one function for each kind of output.
+"""Makes texts of other people safe to show: one function for each kind of output.
 
 Names of scenes, labels, reasons and messages may come from a store, an archive or a server of
 somebody else. They may hold codes that a terminal obeys, formulas that a spreadsheet runs, markup
@@ -21,8 +21,8 @@ _MAX_TERMINAL_LINE = 20_000
 _INVISIBLE = re.compile(
     "[\u034f\u115f\u1160\u17b4\u17b5\u180b-\u180f\u3164\ufe00-\ufe0d\uffa0\U000e0100-\U000e01ef]"
 )
-#: The start of a cell, also of one that a semicolon would begin in many countries, with a character
-#: after which a spreadsheet reads a formula. The wide ones are read like those of ASCII.
+#: The place before a character with which a spreadsheet's formula begins: at the start of a text,
+#: or after a semicolon, which separates cells in many countries. Wide forms of ASCII count too.
 _FORMULA = re.compile(r"(^|;\s*)(?=[=+\-@＝＋－＠])")
 #: A number with its sign, as tables print it; the arrow says whether a change is an improvement.
 _NUMBER = re.compile(r"[+-]?\d[\d,.]*(e[+-]?\d+)?( (%|dB))?( [↑↓=])?", re.ASCII)
@@ -31,8 +31,9 @@ _MARKDOWN = str.maketrans(
     | {"&": "&amp;", "<": "&lt;", ">": "&gt;"}
     | {"@": "@<!-- -->"}  # GitHub makes links of e-mail addresses whose characters are escaped
 )
-#: What begins a list or a rule where it begins a paragraph, and what is a link without brackets.
+#: The mark of a list or a rule at the start of a paragraph.
 _MARKDOWN_START = re.compile(r"^(\d{0,9})([-+.)])(?=[\s-]|$)")
+#: The part of an address that makes GitHub show a link without brackets.
 _MARKDOWN_LINK = re.compile(r":(?=//)|(?<=www)\.")
 _LATEX = str.maketrans(
     {char: f"\\{char}" for char in "&%$#_{}"}
@@ -128,9 +129,9 @@ def for_latex(text: str) -> str:
     return _NOT_PDFLATEX.sub(_by_number_in_pdflatex, escaped)
 
 
-def _by_number_in_pdflatex(found: re.Match[str]) -> str:
-    numbers = " ".join(f"U+{ord(char):04X}" for char in found[0])
-    return rf"\ifdefined\Umathchar {found[0]}\else {numbers}\fi{{}}"
+def _by_number_in_pdflatex(run: re.Match[str]) -> str:
+    numbers = " ".join(f"U+{ord(char):04X}" for char in run[0])
+    return rf"\ifdefined\Umathchar {run[0]}\else {numbers}\fi{{}}"
 
 
 def for_file_name(text: str) -> str:

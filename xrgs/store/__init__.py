@@ -1,1 +1,1 @@
-"""What a cell is, and where it is kept."""
+"""Cells: their identity, their results, and the store that keeps them."""

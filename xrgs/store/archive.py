@@ -1,12 +1,12 @@
-"""The border of a store: packs results for others, and imports what others have made.
+"""Packs results of a store for other people, and imports their stores.
 
 `pack` writes done cells, their variants and the records of their sweeps into one archive, which is
-a store when it is unpacked. It has what tables are made of and what a sweep goes on from, without
-logs, and without the full paths of photographs and stores that configs and commands name.
+a store when it is unpacked. The archive has the files that reports are made from and that sweeps
+continue from. It has no logs, and no full paths: those in configs and commands become relative.
 
 `import_store` copies a store of somebody else, an archive or a folder, into one's own. Archives are
-unpacked by tarfile's filter `data`. Each file is decoded by its type where it is JSON or CSV, and
-verified by its hash. What does not pass is left out and named.
+unpacked by tarfile's filter `data`. JSON and CSV files are decoded by their types, and all files
+are verified by their hashes. An item that fails a check is left out and named.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ _Files = dict[str, tuple[bytes, float]]
 
 @dataclass(frozen=True)
 class Packed:
-    """What was packed, and what was not."""
+    """How much was packed, and which items were left out."""
 
     cells: int
     variants: int
@@ -89,8 +89,8 @@ def pack(
         sweeps: Ids of the sweeps whose records are packed; empty for all that have such a cell.
 
     Returns:
-        The numbers of what was packed. What is damaged, or can't be read now, is left out and
-        named.
+        The numbers of packed cells, variants and records, and a line for each that is damaged or
+        can't be read now, and was left out.
 
     Raises:
         StoreError: `out` can't be written, or the store can't be read.
@@ -111,8 +111,8 @@ def pack(
     records = [packed(name, partial(_record, store, name, here)) for name in sweep_ids]
     with errors_named(out):
         size = _write(out, [*done.values(), *variants, *records])
-    count = [len(of) - of.count({}) for of in (variants, records)]
-    return Packed(len(done), count[0], count[1], size, tuple(left_out))
+    counts = [len(items) - items.count({}) for items in (variants, records)]
+    return Packed(len(done), counts[0], counts[1], size, tuple(left_out))
 
 
 def _sweeps_of(store: Store, cell_ids: set[str]) -> set[str]:
@@ -141,7 +141,7 @@ def _cell(cell: CellFolder, here: Path) -> _Files:
     """Return the files of a done cell as if it were trimmed, with its config's paths relative."""
     cell.identity()  # must be readable: it names the variant
     status = cell.trimmed_status()
-    contents = {name: _verified(cell.path, name, of.sha256) for name, of in status.files.items()}
+    contents = {name: _verified(cell.path, name, e.sha256) for name, e in status.files.items()}
     config = json_text(_relative(json.loads(contents[CONFIG]), here)).encode()
     entry = FileEntry(len(config), hashlib.sha256(config).hexdigest())
     status = msgspec.structs.replace(status, files=status.files | {CONFIG: entry})
@@ -199,27 +199,27 @@ def _relative_argument(word: str, here: Path) -> str:
 
 # Importing
 
-#: The hidden folder, in the store and beside the final places, of what has no name yet.
+#: Name of the hidden folders, in the store and beside the final places, where items are put first.
 _STAGING = ".importing"
 _ID = "[0-9a-f]{16}"
-#: The names of what is imported, by the folder of its kind.
+#: Folder of a kind of items -> the names that its items have.
 _NAMES = {
     "variants": re.compile(f"(trimmed-)?{_ID}-{_ID}"),
     "scenes": re.compile(_ID),
     "cells": re.compile(_ID),
     "sweeps": re.compile(f"{_ID}\\.json"),
 }
-#: What stores have besides, and an import passes over: what is running, made again, or set aside.
+#: Names that an import passes over: hidden folders, failed scenes, and folders that were set aside.
 _PASSED_OVER = re.compile(r"\..*|failed-.*|.*\.aside-.*")
 #: Files of a cell or a variant that are not copied.
 _NOT_COPIED = (NOT_RESULTS - {STATUS}) | {saved_variant.LOG}
 #: Files that every done cell has.
-_OF_EVERY_CELL = ("config.json", "identity.json", "provenance.json", "summary.json", "scores.csv")
+_REQUIRED = ("config.json", "identity.json", "provenance.json", "summary.json", "scores.csv")
 
 
 @dataclass(frozen=True)
 class Imported:
-    """What an import has added to a store, and what it has left out."""
+    """How much an import has added to a store, and which items it has left out."""
 
     cells: int
     variants: int
@@ -240,14 +240,14 @@ def import_store(source: Path, store: Store) -> Imported:
 
     Cells that are not done, checkpoints, logs and reports are not imported. Each cell, variant,
     scene and record gets its name once it is whole and on the disk. An import that was stopped
-    goes on when it is run again: what it has imported is already there.
+    goes on when it is run again.
 
     Args:
         source: The archive (`.tar`, `.tar.xz`, `.tar.gz`, `.tar.bz2`), or the folder of a store.
         store: The store to copy to; it is made where it is missing.
 
     Returns:
-        The numbers of what was imported, and a line for each thing that was left out.
+        The numbers of imported items, and a line for each reason why items were left out.
 
     Raises:
         StoreError: The source is no store; an archive is damaged, or has a link or a name outside
@@ -304,11 +304,11 @@ def _regular_files(member: tarfile.TarInfo, folder: str) -> tarfile.TarInfo | No
 
 @dataclass
 class _Import:
-    """Copies what is whole. An item is a cell, a variant, a scene or a record of a sweep."""
+    """Copies intact items. An item is a cell, a variant, a scene or the record of a sweep."""
 
     store: Store
     left_out: dict[str, list[str]] = field(default_factory=dict)
-    """The names of what is not imported, by the reason."""
+    """Reason -> the names of the items that are left out for it."""
 
     @property
     def unpacked(self) -> Path:
@@ -326,7 +326,7 @@ class _Import:
         }
 
     def clear(self) -> None:
-        """Remove what this import, or a stopped one before it, has left in the hidden folders."""
+        """Remove the hidden folders, also those of an import that was stopped."""
         for home in (self.store.path, *self.homes().values()):
             remove_path(home / _STAGING)
 
@@ -392,12 +392,12 @@ class _Import:
 
 
 def _check_cell(folder: Path) -> None:
-    """Raise `XrgsError` where a cell is not done, or not what its files and its name say."""
+    """Raise `XrgsError` where a cell is not done, is damaged, or its id does not fit its files."""
     cell = CellFolder(folder)
     status = cell.status()
     if status.state != "done":
         raise StoreError(f"the cell has {status.state}")
-    if missing := set(_OF_EVERY_CELL) - status.files.keys():
+    if missing := set(_REQUIRED) - status.files.keys():
         raise StoreError(f"status.json: files: {min(missing)} is not listed")
     if damage := cell.verify():
         raise StoreError("; ".join(damage))

@@ -1,4 +1,4 @@
-"""Plans and begins attempts at a cell, and removes cells: what changes the folder of a cell's name.
+"""Plans and begins attempts at a cell, and removes cells: each changes which folder has its name.
 
 A sweep first writes a cell's config and identity (`plan_cell`). Each attempt at the cell then gets
 a folder of its own, which takes the place of the one before. The process of an attempt works in
@@ -93,16 +93,16 @@ def begin_attempt(cell: CellFolder, is_owner: Callable[[], bool] = lambda: True)
 def remove_cell(cell: CellFolder) -> None:
     """Remove a cell, whose lease the caller holds.
 
-    The cell loses its name first: what a kill leaves of it is no cell, and is removed with the next
-    attempt or by `xrgs-store gc`.
+    The folder is renamed first. If a kill leaves a part of it, that part is no cell: the next
+    attempt or `xrgs-store gc` removes it.
 
     Raises:
         OSError: The cell can't be removed.
     """
-    gone = _hidden(cell.path, "new")
-    cell.path.rename(gone)
-    sync_name(gone)
-    remove_path(gone)
+    renamed = _hidden(cell.path, "new")
+    cell.path.rename(renamed)
+    sync_name(renamed)
+    remove_path(renamed)
 
 
 def _stopped(cell: CellFolder) -> CellFolder | None:
@@ -124,12 +124,12 @@ def _can_resume(attempt: CellFolder) -> bool:
 
 
 def _hidden(folder: Path, kind: str) -> Path:
-    """Return a name that no folder has, for a folder that is made or replaced."""
+    """Return an unused hidden name beside a cell's folder, for a folder of one kind."""
     return folder.with_name(f".{folder.name}.{kind}-{secrets.token_hex(4)}")
 
 
 def _leftovers(folder: Path, kind: str) -> list[CellFolder]:
-    """Return the hidden folders of one kind: attempts (`old`), or what nobody needs (`new`)."""
+    """Return a cell's hidden folders of one kind: attempts (`old`), or rubbish (`new`)."""
     prefix = f".{folder.name}.{kind}-"
     names = [name for name in list_names(folder.parent) if name.startswith(prefix)]
     return [CellFolder(folder.with_name(name)) for name in names]
@@ -140,7 +140,7 @@ def _settle_leftovers(folder: Path) -> None:
     for old in _leftovers(folder, "old"):
         name = _hidden(folder, "new") if _can_resume(old) else _free_name(folder)
         old.path.rename(name)
-        # What a power failure leaves of a removal must not pass for an attempt.
+        # After a power failure, a folder that was half removed must not pass for an attempt.
         sync_name(name)
     for new in _leftovers(folder, "new"):
         _remove(new.path)

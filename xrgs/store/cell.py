@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-#: Rows of the history that the shown loss is the mean of. Each row is the loss of one view.
+#: The shown loss is the mean of this many rows of the history. Each row is the loss of one view.
 _SHOWN_ROWS = 10
 #: Seconds between two writes of the history while a cell trains.
 _CURVES_S = 5.0
@@ -82,7 +82,7 @@ class CellCheckpoint(Checkpoint):
         self._stop = stop
         self._curves = curves
         self._rows, self._curves_due = 0, 0.0
-        """Rows of the history in its file, and when the file may be written again."""
+        """Number of rows in the file of the history, and when it may be written again."""
         self._recorder: TrainingRecorder | None = None
         self._components = Components()
 
@@ -93,7 +93,7 @@ class CellCheckpoint(Checkpoint):
         self._components = cast("Components", objects.get("components", self._components))
 
     def findings(self) -> list[str]:
-        """Return what the components of the training have found."""
+        """Return the lines that components of the training have for the user."""
         return self._components.findings()
 
     def save_if_due(self, step: int) -> float:
@@ -121,14 +121,14 @@ class CellCheckpoint(Checkpoint):
         return seconds + self._write_curves_if_due()
 
     def _write_curves_if_due(self) -> float:
-        """Write what the recorder has where there are new rows; return the seconds that it took."""
+        """Write the curves if there are new rows; return the seconds that it took."""
         start, recorder = time.monotonic(), self._recorder
         if recorder is None or not self._curves or start < self._curves_due:
             return 0.0
         if len(recorder.history) == self._rows:
             return 0.0
         with suppress(OSError):  # they are written again at the end, where an error counts
-            # In this order: what was evaluated before the history's last row is in the other file.
+            # The scores first, so that they are there for every step that the history has.
             write_curves(self._folder, recorder.history, recorder.scores)
         self._rows, end = len(recorder.history), time.monotonic()
         self._curves_due = end + _CURVES_S
@@ -136,7 +136,7 @@ class CellCheckpoint(Checkpoint):
 
 
 def _note(recorder: TrainingRecorder) -> str:
-    """Return what people want to know of a training, for example `84,000 Gaussians, loss 0.041`."""
+    """Return the state of a training in words, for example `84,000 Gaussians, loss 0.041`."""
     rows = recorder.history[-_SHOWN_ROWS:]
     loss = fmean(row["loss"] for row in rows)
     parts = [f"{rows[-1]['gaussians']:,} Gaussians", f"loss {loss:.3g}"]
@@ -210,9 +210,9 @@ def _train_and_score(
         what = msgspec.structs.replace(what, machines_in_turn="; ".join(machines))
         _write_struct(folder.path / "provenance.json", what)
     shown.note = ""
-    count, found = len(trained.gaussians), checkpoint.findings()
+    count, findings = len(trained.gaussians), checkpoint.findings()
     _log.info("trained %d steps in %.1f s: %d Gaussians", conf.train.steps, trained.seconds, count)
-    for line in found:
+    for line in findings:
         _log.info("%s", line)
     peak_rss_bytes = peak_rss()  # read before evaluation, which may load the network of LPIPS
     save_ply(
@@ -220,7 +220,7 @@ def _train_and_score(
         trained.gaussians,
         antialiased=conf.splat.raster.antialiased,
         durable=False,
-        exact=True,  # what was scored, so that it can be scored again
+        exact=True,  # the very Gaussians that are scored, so that they can be scored again
     )
     write_curves(folder, trained.history, trained.scores)
     render_time_ms = protocol.render_time(trained.gaussians, data.test, conf.splat)
@@ -239,7 +239,7 @@ def _train_and_score(
         grow_grad2d=trained.grow_grad2d,
         work=dict(trained.work),
         stage_seconds=dict(trained.stage_seconds),
-        found=tuple(found),
+        found=tuple(findings),
     )
     _write_struct(folder.path / "summary.json", summary)
     return [view.name for view in data.test]

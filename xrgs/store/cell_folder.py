@@ -53,7 +53,8 @@ class CellState:
     `corrupt` or `done`."""
     reason: str = ""
     unreadable: bool = False
-    """Whether it is `failed` since a file can't be read. It may be done, and is not changed."""
+    """Whether the state is `failed` only because a file can't be read now. The cell may be done,
+    and is not changed."""
 
     @classmethod
     def of_error(cls, error: StoreError | OSError) -> CellState:
@@ -71,7 +72,7 @@ class CellFolder:
 
     path: Path
     name: str = ""
-    """The cell's id, where the folder's own name is another one."""
+    """The cell's id, where the folder has another name."""
 
     @property
     def id(self) -> str:
@@ -127,7 +128,7 @@ class CellFolder:
         return CellState("unfinished", "it was stopped before it ended")
 
     def steps_to_resume(self) -> int:
-        """Return about how many steps the next attempt need not repeat: the checkpoint has them.
+        """Return the number of steps, about, that the next attempt takes from the checkpoint.
 
         They are counted in the history, which is written as the training goes on; 0 where the cell
         has no checkpoint or its history can't be read.
@@ -141,7 +142,7 @@ class CellFolder:
             return 0
 
     def running(self, owner: str) -> CellState:
-        """Return the state of a cell whose lease the described process holds."""
+        """Return the state of a cell that a process is training; `owner` describes the process."""
         now = progress.read(self.progress)
         return CellState("running", f"by {owner}" + (f": {now}" if now else ""))
 
@@ -172,19 +173,19 @@ class CellFolder:
         """
         try:
             status = self.status()
-            wrong = [line for name, of in status.files.items() if (line := self._wrong(name, of))]
+            damage = [d for name, entry in status.files.items() if (d := self._damage(name, entry))]
             listed = status.files.keys() | status.trimmed.keys() | NOT_RESULTS
-            wrong += [
+            damage += [
                 f"{self.path}/{name}: it does not belong there"
                 for name, _ in walk_files(self.path)
                 if name not in listed
             ]
-            if not wrong:
+            if not damage:
                 self._decode(status)
         except (StoreError, OSError) as error:
             reason = CellState.of_error(error).reason.replace(f"{self.path}/", "")
             return [f"{self.path}: {reason}"]
-        return wrong
+        return damage
 
     def _decode(self, status: Status) -> None:
         """Raise `StoreError` where a JSON file of a done cell is not of its type."""
@@ -196,8 +197,8 @@ class CellFolder:
         for name in structs.keys() & status.files.keys():
             read_struct(self.path / name, structs[name])
 
-    def _wrong(self, name: str, entry: FileEntry) -> str:
-        """Return what is wrong with one of the cell's files; empty where nothing is."""
+    def _damage(self, name: str, entry: FileEntry) -> str:
+        """Return a line that says how a file differs from its entry; empty where it is intact."""
         try:
             intact = file_digest(self.path / name) == entry.sha256
         except OSError as error:
@@ -225,7 +226,7 @@ class CellFolder:
         self._write_status(
             Status("done", views=tuple(views), files=files, scored_by=dict(scored_by))
         )
-        self.drop_checkpoint()  # after the status: a cell that is killed before needs it
+        self.drop_checkpoint()  # last: a cell that is killed before still needs it
 
     def rescored(self, names: Sequence[str], scored_by: Mapping[str, str]) -> None:
         """Keep new scores of a done cell: the caller has written them and holds the lease.
@@ -429,7 +430,7 @@ class CellFolder:
         return variant.load(variants / variant_id)
 
     def dataset(self) -> Dataset:
-        """Load what the cell was trained and scored on: photographs, cameras, points.
+        """Load the data that the cell was trained and scored on: photographs, cameras, points.
 
         With `train.validation`, `test` has the held-out training views that its scores are of.
         The cameras and points are in the normalised world of the Gaussians.
@@ -460,5 +461,5 @@ class CellFolder:
 
 
 def _is_heavy(name: str) -> bool:
-    """Return whether only pictures, viewers and `rerun=` need a file of a done cell."""
+    """Return whether a file of a done cell is needed only by pictures, viewers and `rerun=`."""
     return name == "splats.ply" or name.startswith("renders/")

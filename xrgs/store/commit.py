@@ -1,7 +1,7 @@
 """The commit of a checkout of xrgs, and what differs from it.
 
 The build backend runs this file, without the package, to write `xrgs/_commit.json` into sdists and
-wheels. It must import the standard library alone.
+wheels. It must import only the standard library.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from pathlib import Path
 
-#: The file in the package, of a wheel or an sdist, that has what `of_checkout` gave at the build.
+#: The file in the package of a wheel or an sdist that has the result of `of_checkout` at the build.
 FILE = "_commit.json"
 #: The folders of a checkout that a cell's numbers come from.
 _SOURCES = ("xrgs", "conf", "sweeps", "hydra_plugins")
@@ -41,7 +41,7 @@ def of_checkout(root: Path) -> dict[str, str | None] | None:
 
 
 def _uncommitted(root: Path) -> str:
-    """Return what differs from the commit: the diff of tracked sources, new files with hashes."""
+    """Return the diff of tracked sources from the commit, and new files with their hashes."""
     listed = _git(root, "ls-files", "--others", "--exclude-standard", "-z", "--", *_SOURCES) or ""
     new = [name for name in listed.split("\0") if name]
     hashes = (_git(root, "hash-object", "--", *new) if new else "") or ""

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from xrgs.mixture.views import Variant, View
 
-#: px: the box that the whole image is fitted into, the side of the centre beside it, and margins.
+#: In px: the box for the whole image, the side of the square centre beside it, and margins.
 _BOX = (256, 192)
 _CENTRE = 192
 _BORDER, _GAP, _TEXT = 4, 8, 16
@@ -39,7 +39,7 @@ def contact_sheet(variant: Variant) -> tuple[Image.Image, list[str]]:
 
     Beside each image is its centre. The centre of a view that is smaller than the largest one is
     magnified by the nearest whole factor, each pixel a square, so that its missing detail can be
-    seen. What is outside a mask is dark.
+    seen. Pixels outside a mask are dark.
 
     Returns:
         An RGB image, and notes: why an image can't be read, or that some views are not drawn.

@@ -1,4 +1,4 @@
-"""Writes a variant or a cell for other programs: COLMAP's or nerfstudio's data, or Gaussians alone.
+"""Writes a variant or a cell for other programs: data for COLMAP or nerfstudio, or only Gaussians.
 
 Cameras, points and splats are in the normalised world of training. `transform.json` has the
 similarity from the world of SfM to that world. Images are undistorted, and each has its own pinhole
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from xrgs.training.dataset import Dataset, LoadedView
 
 _SPLATS = "splats.ply"
-#: Formats of one file with the Gaussians alone; it is named so.
+#: Formats of a file that has only the Gaussians; each is also the file's suffix.
 SPLAT_FORMATS = ("ply", "glb", "spz")
 
 
@@ -117,8 +117,8 @@ def export_splats(path: Path, form: str, out: Path) -> str:
     except OSError as error:
         raise XrgsError(f"out={out}: {error.strerror}") from error
     kind = "antialiased Gaussians" if antialiased else "Gaussians"
-    of = f" of {total}, without those that no render shows" if total > len(gaussians) else ""
-    return f"{len(gaussians)} {kind}{of}: written to {out}"
+    left_out = f" of {total}, without those that no render shows" if total > len(gaussians) else ""
+    return f"{len(gaussians)} {kind}{left_out}: written to {out}"
 
 
 def without_invisible(gaussians: Gaussians, alpha_min: float) -> Gaussians:
@@ -186,7 +186,7 @@ def _load(folder: Path, cell: CellFolder | None) -> tuple[Variant, Dataset]:
 
 
 def _views(data: Dataset) -> Iterator[tuple[str, str, LoadedView]]:
-    """Yield file name, split and view of each image. Names alone may occur in both splits."""
+    """Yield file name, split and view of each image. Views of both splits may have one name."""
     for split, views in (("train", data.train), ("test", data.test)):
         for view in views:
             yield f"{split}_{view.name}.png", split, view
@@ -241,7 +241,7 @@ def _write_nerfstudio(data: Dataset, images: list[PinholeImage], target: Path) -
         files[split].append(f"images/{name}")
     content = {
         "camera_model": "OPENCV",
-        "orientation_override": "none",  # the splats would not turn with the cameras
+        "orientation_override": "none",  # else nerfstudio turns the cameras, but not the splats
         "ply_file_path": "points.ply",
         "train_filenames": files["train"],
         "val_filenames": files["test"],

@@ -1,21 +1,21 @@
 """The identity of a cell: every value that can change one of its trained numbers, nothing else.
 
-1. Words don't count: comments, docstrings and blank lines of the code change no id.
-2. What is off is absent: a component that is off, its settings and its module are not in the
-   identity, nor is any key at its `off` value (`xrgs.config.off`).
+1. Comments, docstrings and blank lines of the code change no id.
+2. A component that is off is not in the identity, nor are its settings and its module, nor any key
+   at its `off` value (`xrgs.config.off`).
 3. The code is every file of `splat/`, `training/` and `csrc/`. Files of a component, a strategy, a
    backend or the dense start count where it is on, and all others always.
 4. Scores are apart: metrics and the evaluation protocol have digests of their own
    (`xrgs.store.scoring`), and `xrgs-store rescore` makes scores anew.
-5. A refactoring that changes no number keeps its cells: `xrgs-store prove` trains a sample of cells
+5. A refactoring that changes no number keeps its cells: `.ci/prove` trains a sample of cells
    again, and declares the digests of the old and the new code equal where all bits are.
 6. Any other change of the hashed code makes new ids.
 
 Paths, thread counts, logging and labels are not part of it, so that a finished cell is found again
-under another label, in another folder or on another machine. Of a machine the identity has the
-arithmetic (`xrgs.splat.backend.arithmetic`): the native backend gives the same bits on all machines
-of the same arithmetic. The last digits of the torch backend differ among machines, and this is not
-part of it. Of the gsplat backend it has the version of gsplat.
+under another label, in another folder or on another machine. The arithmetic of the machine
+(`xrgs.splat.backend.arithmetic`) is part of it: the native backend gives the same bits on all
+machines of one arithmetic. The last digits of the torch backend differ from machine to machine, and
+the identity does not tell them apart. For the gsplat backend it has the version of gsplat.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ from xrgs.store.schema import Identity
 if TYPE_CHECKING:
     from xrgs.config import Conf
 
-#: The code that trains. Every file counts always, but those of the backends, of the dense start, of
-#: the strategies and of the components: these count where they are on.
+#: The code that trains. The files of backends, the dense start, strategies and components count
+#: where these are on; every other file counts always.
 CODE = CodeFolders(
     folders=("splat", "training"),
     whole_parts=("splat/gsplat", "splat/native", "splat/torch", "training/dense"),
@@ -49,14 +49,14 @@ CODE = CodeFolders(
         | {file for key in BUILT_IN if (file := file_of(key))}
     ),
 )
-#: The parts of each backend. Of the kernels these are the C++ sources, and not the compiled module:
+#: The parts of each backend. The kernels count by their C++ sources, and not as compiled module:
 #: two builds of the same sources differ in their bytes and give the same numbers.
 _BACKENDS: dict[str, dict[str, tuple[str, ...]]] = {
     "native": {"native": ("splat/native", "csrc")},
     "torch": {"torch": ("splat/torch",)},
     "gsplat": {"gsplat": ("splat/gsplat",), "torch": ("splat/torch",)},
 }
-#: The code that places the first Gaussians, by the values of `splat.init`; that of others is core.
+#: `splat.init` -> the code that places the first Gaussians. For other values it is in the core.
 _STARTS = {"dense": ("training/dense",)}
 
 
@@ -123,8 +123,8 @@ def code_now(
     return {part: digest for part, digest in code.items() if digest != ABSENT}
 
 
+#: `code_now` of the files as they were at the first call of this process. A plan calls it often.
 training_code = cache(code_now)
-"""`code_now` of the files as they were when this process first asked, which a plan needs often."""
 
 
 def _files(
@@ -140,7 +140,7 @@ def _files(
 
 
 def changed_code(identity: Identity, *, cached: bool = False) -> list[str]:
-    """Return the parts of the installed code that differ from those of an identity, sorted.
+    """Return the parts of the code that have changed since an identity was made, sorted.
 
     Args:
         identity: The identity of a cell.
@@ -157,7 +157,7 @@ def changed_code(identity: Identity, *, cached: bool = False) -> list[str]:
 
 
 def current_code(identity: Identity, *, cached: bool = False) -> dict[str, str]:
-    """Return the digests that the parts of an identity's code have in the installed package."""
+    """Return the digests, in the installed package, of the parts of code that an identity needs."""
     names = tuple(sorted(identity.components.get("plugins", {})))
     code = training_code if cached else code_now
     init = str(identity.splat.get("init", "sfm"))

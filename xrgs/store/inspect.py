@@ -1,4 +1,4 @@
-"""Says how a variant was made: notes for sweeps and reports, and all for `xrgs-data inspect`.
+"""Says how a variant was made: notes for sweeps and reports, and texts for `xrgs-data inspect`.
 
 Nothing here imports torch.
 """
@@ -30,19 +30,20 @@ if TYPE_CHECKING:
     from xrgs.mixture.views import Variant, View
 
 
-#: Views have one camera where the angle between them, in degrees, and the distance, as a share of
-#: the cameras' extent, are at most these. Of two sets of copies SfM placed all within 0.06 degrees
-#: and 0.9 %. In the scenes of the studies no other pair is within four times both limits.
+#: Two views count as taken by one camera where the angle between them, in degrees, and the
+#: distance, as a share of the cameras' extent, are at most these. SfM placed the copies of two sets
+#: within 0.06 degrees and 0.9 %. In the scenes of the studies no other pair is within four times
+#: both limits.
 _SAME_ANGLE, _SAME_PLACE = 0.1, 0.01
 #: The least share of coarse training views in a mixture. Our choice: `plus` gains 0.81 dB with a
 #: share of 0.45 (monstree), and no PSNR with 0.11 (reichstag).
 _MIXTURE_FROM = 0.25
 #: The recipe (a file of `conf/ablation/`) for a mixture, and the one for photographs alike.
 MIXTURE_RECIPE, ALIKE_RECIPE = "plus", "tuned_baseline"
-#: How the note begins that undegraded photographs differ too little for HR and LR, and how all
-#: notes begin that say what a split into HR and LR views is worth.
+#: The beginning of the note that undegraded photographs differ too little for HR and LR classes.
 _MEANINGLESS = "the split by variant.tags="
-_OF_SPLITS = (_MEANINGLESS, "sampling rates of training views differ by")
+#: The beginnings of all notes on a split into HR and LR views.
+_SPLIT_NOTES = (_MEANINGLESS, "sampling rates of training views differ by")
 
 
 class SfmAttempt(Struct):
@@ -73,7 +74,7 @@ class SfmReport(Struct):
     tags: str | None = None
     degradation: str | None = None
     notes: tuple[str, ...] = ()
-    """Sentences on what was taken, left out, turned, converted or masked, by photographs' names."""
+    """Sentences on photographs that were taken, left out, turned, converted or masked."""
     pose_error: dict[str, float] = {}
     """`position_percent` of the extent, `rotation_degrees`, and `..._max` of each."""
     pose_error_against: str = ""
@@ -91,7 +92,7 @@ class SfmReport(Struct):
 
     @property
     def alike(self) -> bool:
-        """Whether the photographs are of one resolution, so that HR and LR tell nothing.
+        """Whether the photographs are of one resolution, so that HR and LR classes mean nothing.
 
         Degraded photographs are never alike.
         """
@@ -101,14 +102,14 @@ class SfmReport(Struct):
 
     @property
     def tagless(self) -> bool:
-        """Whether photographs as they are turned out alike, so that no tag is worth a word."""
+        """Whether the photographs are undegraded and alike, so that tags are not shown."""
         return self.as_they_are and self.alike
 
     @property
     def own_notes(self) -> tuple[str, ...]:
-        """The notes, without those on a split that nobody asked for."""
-        splits = _OF_SPLITS if self.as_they_are else ()
-        return tuple(note for note in self.notes if not note.startswith(splits))
+        """The notes; without those on HR and LR classes where no view is degraded."""
+        left_out = _SPLIT_NOTES if self.as_they_are else ()
+        return tuple(note for note in self.notes if not note.startswith(left_out))
 
     @property
     def not_trained(self) -> tuple[str, ...]:
@@ -128,11 +129,11 @@ class SfmReport(Struct):
         Args:
             most: The most names in such a sentence.
         """
-        if not (self.hr or self.lr):  # of a scene that failed: the reason names the views
+        if not (self.hr or self.lr):  # a scene that failed, whose reason names the views
             return self.own_notes
         lost = (("trained on", self.not_trained), ("scored", self.not_scored))
         unplaced = [
-            f"not placed, and so not {done}: {listed(names, most)}" for done, names in lost if names
+            f"not placed, and so not {use}: {listed(names, most)}" for use, names in lost if names
         ]
         return (*self.own_notes, *unplaced)
 
@@ -153,9 +154,9 @@ def read_report(folder: Path) -> SfmReport:
 
 
 def shared_cameras(manifest: Manifest) -> list[str]:
-    """Say which views have one camera: they are copies of one photograph, or nearly.
+    """Return a note on views that share one camera: copies of one photograph, or nearly.
 
-    Copies whose names are not related are found by nothing else.
+    No other check finds copies whose names are not alike.
     """
     splits = {"train", "test"} if manifest.held_out else {"train"}
     views = [view for view in manifest.views if view.split in splits]
@@ -262,25 +263,25 @@ class Mixture(NamedTuple):
 
     @property
     def is_one(self) -> bool:
-        """Whether so many views are coarse that all are a mixture."""
+        """Whether enough views are coarse to call the photographs a mixture."""
         return self.coarse >= _MIXTURE_FROM * self.views
 
 
 def mixture(views: Iterable[View | ViewEntry]) -> Mixture:
     """Count the coarse training views among the views of a variant."""
     needs = [view.supersampling for view in views if view.split == "train"]
-    # `supersampled`, and so the recipes, render a view larger by its need, rounded.
+    # `supersampled`, and so the recipes, render a view larger by its `supersampling`, rounded.
     return Mixture(sum(round(need) > 1 for need in needs), len(needs))
 
 
 def _mixture(frozen: Variant) -> str:
     """Say whether the training views are a mixture, and which recipe is for it."""
-    found = mixture(frozen.views)
+    counts = mixture(frozen.views)
     recipes = f"+ablation={ALIKE_RECIPE} is for such views"
-    if found.is_one:
+    if counts.is_one:
         recipes = f"+ablation={MIXTURE_RECIPE} and +ablation=lean are for mixtures"
     return (
-        f"{'a mixture' if found.is_one else 'hardly a mixture'}: {found.coarse} of {found.views}"
+        f"{'a mixture' if counts.is_one else 'hardly a mixture'}: {counts.coarse} of {counts.views}"
         " training views would need at least 1.5 times as many px a side to show the scene as"
         f" finely as the finest; {recipes}"
     )

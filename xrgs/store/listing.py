@@ -114,7 +114,7 @@ class CellRow:
 
     @cached_property
     def bytes(self) -> int | None:
-        """The size of the cell's files; None where it can't be told."""
+        """The size of the cell's files; None where the folder can't be read."""
         return size_of(self.folder.path)
 
 
@@ -149,8 +149,8 @@ def cell_rows(
         state = cell.state(verify=verify)
         if state.name != "done" and cell.id in holders:
             state = cell.running(holders[cell.id])
-        of = tuple(sweeps.get(cell.id, ()))
-        rows.append(CellRow(cell, state, recorded.get(cell.id), of, _identity(cell)))
+        sweep_ids = tuple(sweeps.get(cell.id, ()))
+        rows.append(CellRow(cell, state, recorded.get(cell.id), sweep_ids, _identity(cell)))
     return sorted(rows, key=lambda row: (row.scene, row.arm, row.seed or 0, row.id))
 
 
@@ -189,9 +189,9 @@ def sweep_rows(
     def state(row: RecordedCell) -> str:
         if row.error:
             return "failed"
-        found = cells.get(row.cell_id or "")
-        pending = found is None or found.state.name in {"absent", "planned", "unfinished"}
-        return "pending" if found is None or pending else found.state.name
+        cell = cells.get(row.cell_id or "")
+        pending = cell is None or cell.state.name in {"absent", "planned", "unfinished"}
+        return "pending" if cell is None or pending else cell.state.name
 
     return [
         SweepRow(name, record, _modified(files[name]), Counter(map(state, record.cells)))
@@ -225,14 +225,14 @@ class Selection:
         """Whether any value restricts the choice."""
         return self != Selection()
 
-    def of(self, cells: Sequence[CellRow]) -> list[CellRow]:
-        """Return the chosen cells.
+    def choose_from(self, cells: Sequence[CellRow]) -> list[CellRow]:
+        """Return the cells that are meant.
 
         Raises:
             XrgsError: No cell has a name that is given, or several ids have one beginning.
         """
         ids = [cell.id for cell in cells]
-        wanted = {full_id(word, ids, of_scene=_done_of(word, cells)) for word in self.ids}
+        named = {full_id(word, ids, done=_done_cells(word, cells)) for word in self.ids}
         self._check("scenes", self.scenes, [cell.scene for cell in cells])
         self._check("ablations", self.ablations, [cell.label for cell in cells])
         self._check("states", self.states, STATES)
@@ -240,7 +240,7 @@ class Selection:
         return [
             cell
             for cell in cells
-            if (not wanted or cell.id in wanted)
+            if (not named or cell.id in named)
             and (not self.scenes or cell.scene in self.scenes)
             and (not self.ablations or cell.label in self.ablations)
             and (not self.states or cell.state.name in self.states)
@@ -250,20 +250,20 @@ class Selection:
         ]
 
     @staticmethod
-    def _check(key: str, wanted: Sequence[str], known: Sequence[str]) -> None:
-        for name in wanted:
-            if name not in known:
-                choices = ", ".join(dict.fromkeys(known)) or "none"
+    def _check(key: str, names: Sequence[str], existing: Sequence[str]) -> None:
+        for name in names:
+            if name not in existing:
+                choices = ", ".join(dict.fromkeys(existing)) or "none"
                 raise XrgsError(f"{key}={name}: no cell has that; choose from: {choices}")
 
 
-def _done_of(scene: str, cells: Iterable[CellRow]) -> dict[str, str]:
+def _done_cells(scene: str, cells: Iterable[CellRow]) -> dict[str, str]:
     """Return the labels of the done cells of a scene, by their ids."""
     return {c.id: c.arm for c in cells if c.scene == scene and c.state.name == "done"}
 
 
 def size_of(path: Path) -> int | None:
-    """Return the bytes of a file, or of all files of a folder; None where it can't be told."""
+    """Return the bytes of a file, or of all files of a folder; None where it can't be read."""
     try:
         return file_bytes(path)
     except OSError:
@@ -274,28 +274,28 @@ def full_id(
     word: str,
     ids: Iterable[str],
     kinds: str = "cells",
-    of_scene: Mapping[str, str] = MappingProxyType({}),
+    done: Mapping[str, str] = MappingProxyType({}),
 ) -> str:
     """Return the id that a word names.
 
     Args:
-        word: An id, the beginning of one id only, or the name of a scene with one done cell.
+        word: An id, a beginning that no other id has, or the name of a scene with one done cell.
         ids: The ids to choose from.
         kinds: The things with these ids, for messages.
-        of_scene: The labels of the done cells of the scene that is named so, by their ids.
+        done: The labels of the done cells of the scene with that name, by the cells' ids.
 
     Raises:
         StoreError: The word names none, or several.
     """
-    known = [*ids]
-    if word in known:
+    ids = [*ids]
+    if word in ids:
         return word
-    found = {one: "" for one in known if one.startswith(word)}
-    found |= {one: f" ({label})" for one, label in of_scene.items()}
-    if len(found) == 1:
-        return next(iter(found))
-    some = listed([f"{one}{label}" for one, label in found.items()], _MAX_LISTED)
-    why = f"no {kinds} have such an id, and no done cell is of such a scene"
-    if found:
+    matches = {full: "" for full in ids if full.startswith(word)}
+    matches |= {full: f" ({label})" for full, label in done.items()}
+    if len(matches) == 1:
+        return next(iter(matches))
+    some = listed([f"{full}{label}" for full, label in matches.items()], _MAX_LISTED)
+    why = f"no {kinds} have such an id, and no done cell is of a scene with this name"
+    if matches:
         why = f"several {kinds} have such an id or scene: {some}"
     raise StoreError(f"{word}: {why}; xrgs-status lists the done ones")

@@ -1,4 +1,4 @@
-"""Datasets for `train` from Python: of a config, which builds what is missing, or of a folder."""
+"""Makes datasets for `train` from Python: for a config, or from the folder of a variant."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ def build_dataset(conf: Conf) -> Dataset:
     """Load the views of a config, building their variant in its store where it is missing.
 
     Building takes minutes: COLMAP places the views. A variant is built once; the next call, and any
-    sweep with the same scene and variant, finds it. What was left out of it, or changed, is logged
-    as warnings.
+    sweep with the same scene and variant, finds it. Warnings in the log say which photographs
+    were left out or changed.
 
     Args:
         conf: The config, as `compose` gives it; `scene`, `variant`, `store`, `seed`, `train.views`

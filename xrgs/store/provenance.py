@@ -23,17 +23,17 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 _PACKAGES = ("torch", "numpy", "pycolmap", "kornia", "scikit-image", "hydra-core", "pandas")
-#: The fields that a cell's times depend on, beside the program.
+#: The fields that a cell's times depend on, apart from the program.
 MACHINE_KEYS = ("cpu", "gpu", "instruction_set", "threads", "backend")
 
 
 def _commit() -> Mapping[str, str | None]:
     """Return `git` and `git_diff_sha256` of the package: of its checkout, or of its build."""
     package = Path(xrgs.__file__).parent
-    found = commit.of_checkout(package.parent)
-    if found is None and (package / commit.FILE).is_file():
-        found = read_struct(package / commit.FILE, dict[str, str | None])
-    return found or {}
+    source = commit.of_checkout(package.parent)
+    if source is None and (package / commit.FILE).is_file():
+        source = read_struct(package / commit.FILE, dict[str, str | None])
+    return source or {}
 
 
 def _cpu() -> str:
@@ -97,7 +97,7 @@ def collect(threads: int, backend: str) -> Provenance:
 
 
 def machine(made: Provenance) -> str:
-    """Return what a cell's times depend on, for example `AMD EPYC, avx2, threads 1, native`."""
+    """Return the machine in words, for example `AMD EPYC, avx2, threads 1, native`."""
     parts = (made.cpu, made.gpu, made.instruction_set, f"threads {made.threads}", made.backend)
     return ", ".join(filter(None, parts))
 
@@ -117,7 +117,7 @@ def processor(made: Provenance) -> str:
 
 @cache
 def this_processor(backend: str) -> str:
-    """Return `processor` of a cell that this machine trains.
+    """Return the processor of this machine, named as by `processor`.
 
     Args:
         backend: The rasterizer in use: `native`, `torch` or `gsplat`.
@@ -130,7 +130,7 @@ def _processor(cpu: str | None, instruction_set: str | None) -> str:
 
 
 class Machines:
-    """The machines that train a cell in turn; its checkpoint hands their names on to the next."""
+    """The names of the machines that train a cell in turn; the checkpoint keeps them."""
 
     def __init__(self, here: str) -> None:
         """Begin with the machine of this process, `here`, see `machine`."""

@@ -27,7 +27,7 @@ _SPLATS = "splats.ply"
 
 @dataclass(frozen=True)
 class Rescored:
-    """What `rescore` has done."""
+    """The result of `rescore`."""
 
     scored: tuple[str, ...]
     """Ids of the cells that were scored anew."""
@@ -78,7 +78,7 @@ def rescore(store: Store, cells: Sequence[CellFolder], also: Sequence[str] = ())
 
 
 def _done(cell: CellFolder) -> dict[str, str]:
-    """Return which code has scored a done cell.
+    """Return the digests of the code that has scored a done cell.
 
     Raises:
         StoreError: The cell is not done, or its status is damaged.
@@ -92,13 +92,13 @@ def _done(cell: CellFolder) -> dict[str, str]:
 
 
 def _score_under_lease(store: Store, cell: CellFolder, also: frozenset[str]) -> None:
-    held = lease.acquire(store.leases, cell.id)
-    if held is None:
+    cell_lease = lease.acquire(store.leases, cell.id)
+    if cell_lease is None:
         raise StoreError("a sweep is training it")
     try:
         _score(cell, also)
     finally:
-        held.release()
+        cell_lease.release()
 
 
 def _score(cell: CellFolder, also: frozenset[str]) -> None:
@@ -113,11 +113,11 @@ def _score(cell: CellFolder, also: frozenset[str]) -> None:
     if file_digest(cell.path / _SPLATS) != cell.status().files[_SPLATS].sha256:
         raise StoreError(f"{_SPLATS} has changed since the cell finished")
     views, settings = cell.dataset().test, cell.config().splat
-    wanted = also | on_request(cell.status().scored_by)
-    with also_scored(wanted):
+    requested = also | on_request(cell.status().scored_by)
+    with also_scored(requested):
         rows = protocol.score_views(cell.gaussians(), views, settings, cell.path / "renders")
-    # A kill between these two writes leaves scores that are not those of the status: the cell is
-    # corrupt until it is scored again.
+    # A kill between these two writes leaves scores that differ from the status: the cell is corrupt
+    # until it is scored again.
     write_text(cell.path / "scores.csv", table_text(rows))
     renders = [f"renders/{view.name}.png" for view in views]
-    cell.rescored(["scores.csv", *renders], scoring_code(wanted))
+    cell.rescored(["scores.csv", *renders], scoring_code(requested))

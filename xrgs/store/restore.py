@@ -1,6 +1,6 @@
 """Makes the images of a variant again, which `xrgs-store trim` has removed.
 
-What SfM found is kept in the variant's folder: camera poses, points and the lens of every
+The variant's folder keeps the results of SfM: camera poses, points and the lens of every
 photograph. The photographs are resized, degraded and undistorted as when the variant was built, so
 that the same photographs and libraries give the same bytes. The variant's hashes verify them.
 """
@@ -44,7 +44,7 @@ class _Report(Struct):
 def restore_images(
     folder: Path, scene: SceneConf, conf: VariantConf, work: Path, cache: Path
 ) -> None:
-    """Make the images of a variant, and verify them by its hashes.
+    """Make the images of a variant, and compare them with the hashes in its list of files.
 
     Args:
         folder: The variant's folder, which has all of its files but the images.
@@ -61,12 +61,12 @@ def restore_images(
     manifest = saved_variant.read_manifest(folder)
     cameras = read_struct(folder / saved_variant.REPORT, _Report).lenses
     lenses = {name: camera.lens for camera in cameras for name in camera.views}
-    given = poses.with_masks(scenes.resolve(scene, cache, conf.long_side), conf.poses)
-    photos = prepare_hr_views(given, conf, work)
+    photographed = poses.with_masks(scenes.resolve(scene, cache, conf.long_side), conf.poses)
+    photos = prepare_hr_views(photographed, conf, work)
     _write_images(folder, manifest.views, photos, lenses, conf)
-    for wrong in checksums.changed(folder, manifest.files):
+    for error in checksums.changed(folder, manifest.files):
         raise StoreError(
-            f"{wrong}: made again from the photographs it is another image, as other versions of"
+            f"{error}: made again from the photographs it is another image, as other versions of"
             " the libraries that read and resize photographs may give"
         )
 
@@ -82,7 +82,7 @@ def _write_images(
     numbers = {name: number for number, name in enumerate(photos.names)}
     if missing := {entry.name for entry in entries} - numbers.keys():
         raise StoreError(f"{folder}: the photograph of its view {min(missing)} is missing")
-    # Each view that was degraded is also there as it was before.
+    # A view that was degraded has two entries; one is its original.
     degraded = {numbers[entry.name] for entry in entries if entry.split == "original"}
     write_degraded(photos, sorted(degraded), conf)
     for entry in progress(entries, "undistorting", "view"):

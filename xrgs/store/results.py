@@ -1,4 +1,4 @@
-"""The files of cells as pandas tables: what `Store.cells` hands out."""
+"""Makes pandas tables of the files of cells, for `Store.cells`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from xrgs.store.cell_folder import CellFolder
     from xrgs.store.schema import RecordedCell, Summary
 
-#: What a sweep's record names a cell by.
+#: The names of a cell in a sweep's record.
 CELL_NAMES = ("scene", "label", "condition")
 #: Groups of a cell's config that become columns; the others do not change a number.
 _CONFIG_GROUPS = ("scene", "variant", "splat", "train", "components")
@@ -46,10 +46,11 @@ def cells_table(rows: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
 
 
 def cell_columns(cell: CellFolder, names: RecordedCell | None) -> dict[str, Any]:
-    """Return what a cell's `identity.json` and `config.json` say of it, as columns of a table.
+    """Return a cell's names, seed, variant and settings, as columns of a table.
 
     Args:
-        cell: The cell; a file that is missing or damaged in it gives no columns.
+        cell: The cell, whose `identity.json` and `config.json` are read. Where one is missing or
+            damaged, its columns are missing or None.
         names: The cell's row in the record of a sweep; None where there is none.
     """
     identity = None
@@ -98,7 +99,7 @@ def over_views(views: pd.DataFrame) -> pd.DataFrame:
     errors = 10 ** (-views["psnr"] / 10)
     grouped = views.assign(psnr_pooled=errors, psnr_worst=views["psnr"]).groupby("cell_id")
     means = grouped.mean()
-    with np.errstate(divide="ignore"):  # no error at all is infinite PSNR
+    with np.errstate(divide="ignore"):  # an error of 0 gives infinite PSNR
         means["psnr_pooled"] = -10 * np.log10(means["psnr_pooled"])
     means["psnr_worst"] = grouped["psnr_worst"].min()
     return means.mask(grouped.count().lt(grouped.size(), axis=0))

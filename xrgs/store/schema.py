@@ -78,7 +78,7 @@ class Summary(Struct, frozen=True):
     grow_grad2d: Number | None = None
     """The growth threshold of densification, which count matching searches for."""
     work: dict[str, Number] = {}
-    """What the steps rendered and left out, see `xrgs.training.work`."""
+    """Sums of the work that the steps did and left out, see `xrgs.training.work`."""
     stage_seconds: dict[str, Number] = {}
     found: tuple[str, ...] = ()
     """What components found out about the photographs, for example `formation: LR views: ...`."""
@@ -125,7 +125,7 @@ class RecordedCell(Struct, frozen=True):
     baseline_id: Name | None
     """The cell that this one is compared with."""
     planned_id: str | None = None
-    """What the cell is asked to be, known before any cell is trained."""
+    """An id of the plan of the cell, known before any cell is trained."""
     error: str | None = None
     """Why the cell can't be trained."""
     state: Literal["unknown", "not placed"] | None = None

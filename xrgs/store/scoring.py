@@ -1,7 +1,7 @@
-"""The identity of scores, apart from that of the training: which code has computed them.
+"""The identity of scores: the code that has computed them. It is no part of a cell's identity.
 
 A cell's `status.json` keeps the digest of the code of each score and of the protocol that renders
-views for them. A new or changed metric makes scores stale, and never the training.
+views for them. A new or changed metric makes the scores stale, but not the training.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ def scoring_code(also: frozenset[str] = frozenset()) -> dict[str, str]:
     Args:
         also: Scores of `ON_REQUEST` to include.
     """
-    wanted = {*VIEW_METRICS, *also}
-    scores = {n: code_digest(*_CODE.part(file)) for n, file in _FILES.items() if n in wanted}
+    names = {*VIEW_METRICS, *also}
+    scores = {n: code_digest(*_CODE.part(file)) for n, file in _FILES.items() if n in names}
     return without_refactorings({PROTOCOL: code_digest(*_CODE.core()), **scores})
 
 
@@ -62,10 +62,11 @@ def stale_scores(scored_by: Mapping[str, str], also: frozenset[str] = frozenset(
 
     Args:
         scored_by: The digests in the cell's `status.json`.
-        also: Scores of `ON_REQUEST` that are lacking too where the cell has none.
+        also: Scores of `ON_REQUEST` that count as lacking where the cell does not have them.
     """
-    known, scored_by = scoring_code(also | on_request(scored_by)), without_refactorings(scored_by)
-    return [name for name, code in known.items() if scored_by.get(name) != code]
+    installed = scoring_code(also | on_request(scored_by))
+    scored_by = without_refactorings(scored_by)
+    return [name for name, code in installed.items() if scored_by.get(name) != code]
 
 
 def on_request(scored_by: Mapping[str, str]) -> frozenset[str]:

@@ -109,7 +109,7 @@ class Store:
         """Whether the folder is a store: whether it is there and has a folder of cells.
 
         Raises:
-            StoreError: It can't be told now; the message names the folder.
+            StoreError: The folder can't be read now; the message names it.
         """
         try:
             return stat.S_ISDIR(self.cells_folder.stat().st_mode)
@@ -122,14 +122,14 @@ class Store:
         """Refuse a folder that is not a store.
 
         Raises:
-            StoreError: It is none, or it can't be told now.
+            StoreError: It is none, or can't be read now.
         """
         if not self.exists:
             raise StoreError(f"store={self.path} is not a store; xrgs-sweep makes one")
 
     @property
     def is_gone(self) -> bool:
-        """Whether a store that was prepared is no longer there; False where it can't be told now.
+        """Whether a store that was prepared is no longer there; False where it can't be read now.
 
         An empty folder in its place, as an unmounted disk leaves it, is no store.
         """
@@ -185,12 +185,12 @@ class Store:
         self._write_nameless(folder)
 
     def _write_nameless(self, folder: Path) -> None:
-        """Write a file that has no name into a folder, and so leave nothing behind."""
+        """Write a nameless file into a folder; it is gone when it is closed."""
         try:
             with tempfile.TemporaryFile(dir=folder) as file:
                 file.write(bytes(_MIN_FREE_BYTES))
         except OSError as error:
-            error.filename = str(folder)  # and not the name of the file, which is random
+            error.filename = str(folder)  # the file's own name is random
             raise self._unwritable(error) from error
 
     def _unwritable(self, error: OSError) -> StoreError:
@@ -226,7 +226,7 @@ class Store:
         return self.variants / variant_id
 
     def cells(self, *, verify: bool = True) -> pd.DataFrame:
-        """List the cells: what they are, whether they are done, and how they scored.
+        """List the cells: their names, configs, states and scores.
 
         `table.loc[:, table.astype(str).nunique() > 1]` keeps the columns in which cells differ.
 
@@ -314,8 +314,8 @@ class Store:
         """Return the cell that a word names.
 
         Args:
-            word: The cell's id, or so much of it that it is that of one cell; the name of a scene
-                that one done cell is of; or a path to the cell's folder or the scene's.
+            word: The cell's id, or a beginning that no other id has; the name of a scene with one
+                done cell; or the path of a cell's or a scene's folder.
 
         Raises:
             StoreError: There is no store, the word names no cell, or it names several.
@@ -329,7 +329,7 @@ class Store:
         """Return the folder of the cell or the variant that a word names.
 
         Args:
-            word: As for `find_cell`, or the same of a variant.
+            word: As for `find_cell`, or the same for a variant.
 
         Raises:
             StoreError: There is no store, the word names no cell or variant, or it names several.
@@ -343,35 +343,35 @@ class Store:
         return folders[self._full_id(word, list(folders), "cells or variants")]
 
     def find_sweep(self, word: str) -> str:
-        """Return the id of the sweep that a word names; of a scene, that of its latest sweep.
+        """Return the id of the sweep that a word names; a scene names its latest sweep.
 
         Args:
-            word: The sweep's id, or so much of it that it is that of one sweep; or the name of a
-                scene, or a path to its folder.
+            word: The sweep's id, or a beginning that no other id has; or the name of a scene, or
+                the path of its folder.
 
         Raises:
             StoreError: There is no store, or the word names no sweep, or several.
         """
         self.check_exists()
         records, name = self._records_or_warnings(), _name_of(word)
-        of_scene = [i for i, r in records.items() if any(row.scene == name for row in r.cells)]
-        latest = {of_scene[-1]: name} if of_scene else {}
+        ids = [i for i, r in records.items() if any(row.scene == name for row in r.cells)]
+        latest = {ids[-1]: name} if ids else {}
         return listing.full_id(name, self.sweep_ids(), "sweeps", latest)
 
     def _full_id(self, word: str, ids: Sequence[str], kinds: str) -> str:
         """Return the one id that a word names."""
         name = _name_of(word)
-        of_scene = {
+        done = {
             cell_id: row.label
             for cell_id, row in self.cell_names().items()
             if row.scene == name and self.cell(cell_id).state(verify=False).name == "done"
         }
-        return listing.full_id(name, ids, kinds, of_scene)
+        return listing.full_id(name, ids, kinds, done)
 
     def cell_folders(self) -> list[CellFolder]:
-        """Return the cells, sorted by id; folders of earlier attempts, whose names have a dot, not.
+        """Return the cells, sorted by id, without folders of earlier attempts (`<id>.aside-1`).
 
-        Whatever else has the name of a cell is among them, a link or a file: its state says so.
+        A link or a file with the name of a cell is among them; its state says that it is corrupt.
 
         Raises:
             StoreError: The folder of cells can't be listed; the message names it.
@@ -477,18 +477,18 @@ class Store:
 
 
 def _name_of(word: str) -> str:
-    """Return the name of the scene where a word is a folder, and else the word."""
+    """Return a word; where it is a folder, the name of the scene in the folder."""
     return scene_name(user_path(word)) if user_path(word).is_dir() else word
 
 
 def _asked_for(row: dict[str, Any]) -> dict[str, Any]:
-    """Return what a row of a record says of a cell before any cell is trained."""
+    """Return the part of a record's row that is known before any cell is trained."""
     names = ("scene", "label", "condition", "variant_seed", "seed", "variant_id", "planned_id")
     return {name: row[name] for name in names}
 
 
 def _modified_ns(file: Path) -> int:
-    """Return when a file was changed; 0 where that can't be told."""
+    """Return when a file was changed; 0 where its status can't be read."""
     try:
         return file.stat().st_mtime_ns
     except OSError:

@@ -1,15 +1,14 @@
-"""Removes the heavy files of done cells and of variants, and records what was removed.
+"""Removes the heavy files of done cells and of variants, and lists the removed files.
 
 A trimmed cell stays done: the files that tables are made of stay, and its `status.json` lists the
 removed files with their sizes and hashes. A trimmed variant keeps its list of views, cameras,
 points and SfM report, in the folder `variants/trimmed-<id>`. Its cells are still found and
 reported. Before a new cell is trained on it, its images are made again from the photographs. SfM is
-not run again: on another machine it may place the cameras otherwise.
+not run again: on another machine it may give other cameras.
 """
 
 from __future__ import annotations
 
-import stat
 from typing import TYPE_CHECKING
 
 from xrgs.errors import StoreError, UnreadableError, XrgsError
@@ -17,7 +16,7 @@ from xrgs.mixture import saved_variant
 from xrgs.mixture.paths import id_of, is_trimmed, trimmed_folder
 from xrgs.runtime import lease
 from xrgs.safeio import checksums
-from xrgs.safeio.files import remove_path, sync_name, sync_tree, walk_files
+from xrgs.safeio.files import file_bytes, remove_path, sync_name, sync_tree
 from xrgs.safeio.records import list_folder
 
 if TYPE_CHECKING:
@@ -29,7 +28,7 @@ _IMAGES = "images"
 
 
 def trimmed_variant(variants: Path, key: str) -> str | None:
-    """Return the id of the trimmed variant of a key (`xrgs.mixture.variant.key`), or None.
+    """Return the id of the trimmed variant with a key (`xrgs.mixture.variant.key`), or None.
 
     Raises:
         StoreError: The folder of variants can't be listed.
@@ -39,7 +38,7 @@ def trimmed_variant(variants: Path, key: str) -> str | None:
 
 
 def check_images(variants: Path, variant_id: str) -> None:
-    """Raise `StoreError` where a variant is trimmed; the message says what can be done."""
+    """Raise `StoreError` where a variant is trimmed; the message says what makes its images."""
     folder = trimmed_folder(variants, variant_id)
     if folder.is_dir():
         raise StoreError(
@@ -51,7 +50,7 @@ def check_images(variants: Path, variant_id: str) -> None:
 def trim_variant(variants: Path, variant_id: str) -> None:
     """Remove the images of a variant, and mark it as trimmed by the name of its folder.
 
-    Trimming a trimmed variant completes a removal that was stopped, and else changes nothing.
+    For a trimmed variant, this completes a removal that was stopped, or changes nothing.
 
     Raises:
         OSError: The folder can't be renamed, or the images can't be removed.
@@ -93,7 +92,8 @@ def restore_variant(
         if not folder.is_dir():
             return
         work = variants / f".{variant_id}.restoring"
-        remove_path(work)  # what a killed process left, as in the variant's own folder
+        # A killed process may have left both.
+        remove_path(work)
         remove_path(folder / _IMAGES)
         work.mkdir()
         try:
@@ -118,8 +118,7 @@ def image_bytes(variants: Path, variant_id: str) -> int:
     """Return the bytes of a variant's images, which trimming it would free."""
     homes = (variants / variant_id, trimmed_folder(variants, variant_id))
     images = [home / _IMAGES for home in homes if (home / _IMAGES).is_dir()]
-    found = [status for folder in images for _, status in walk_files(folder)]
-    return sum(status.st_size for status in found if stat.S_ISREG(status.st_mode))
+    return sum(map(file_bytes, images))
 
 
 def verify_variant(folder: Path) -> list[str]:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Verification:
-    """How much was hashed, and what is damaged."""
+    """The extent of a verification, and the damage that it has found."""
 
     files: int
     bytes: int
@@ -55,8 +55,7 @@ def verify(store: Store) -> Verification:
     Raises:
         StoreError: There is no such store, or it can't be read now.
     """
-    if not store.exists:
-        raise StoreError(f"store={store.path} is not a store; xrgs-sweep makes one")
+    store.check_exists()
     start = time.perf_counter()
     damage: list[str] = []
     parts = list(_parts(store, damage))
@@ -74,8 +73,8 @@ def describe(verification: Verification) -> str:
     damage = verification.damage
     lines = ["damaged, or can't be read:", *(f"  {line}" for line in damage)] if damage else []
     extent = f"{verification.files:,} files, {format_size(verification.bytes)}"
-    found = f"{len(damage)} damaged" if damage else "all of them as they were written"
-    lines.append(f"hashed: {extent}, in {verification.seconds:.1f} s; {found}")
+    result = f"{len(damage)} damaged" if damage else "all of them as they were written"
+    lines.append(f"hashed: {extent}, in {verification.seconds:.1f} s; {result}")
     return "\n".join(map(for_line, lines))
 
 
@@ -135,6 +134,6 @@ def _record(store: Store, sweep_id: str) -> list[str]:
 
 def _extent(path: Path) -> tuple[int, int]:
     """Return the number of regular files at a path or below, and their bytes."""
-    found = [status for _, status in walk_files(path)] if path.is_dir() else [path.lstat()]
-    sizes = [status.st_size for status in found if stat.S_ISREG(status.st_mode)]
+    statuses = [status for _, status in walk_files(path)] if path.is_dir() else [path.lstat()]
+    sizes = [status.st_size for status in statuses if stat.S_ISREG(status.st_mode)]
     return len(sizes), sum(sizes)

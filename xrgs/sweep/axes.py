@@ -38,8 +38,8 @@ class CellSpec:
     @property
     def matched_to(self) -> str | None:
         """The `matched_to` among the changes; None if there is none, or it is null."""
-        found = [text.partition("=")[2] for text in self.changes if _name(text) == "matched_to"]
-        return found[0] if found and found[0] != "null" else None
+        values = [text.partition("=")[2] for text in self.changes if _name(text) == "matched_to"]
+        return values[0] if values and values[0] != "null" else None
 
     @property
     def without_match(self) -> CellSpec:
@@ -101,7 +101,7 @@ def expand(arguments: Sequence[str], loader: ConfigLoader | None = None) -> list
 
 
 def _values(override: Override) -> list[str]:
-    """Return the override once for each of its values."""
+    """Return one override for each value of an axis."""
     key = override.get_key_element()
     try:
         if not override.is_sweep_override():

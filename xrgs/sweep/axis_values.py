@@ -1,9 +1,9 @@
-"""Reads the overrides of a command line, with the values that an axis names.
+"""Parses the overrides of a command line, so that each axis has the values that the user means.
 
 Hydra's grammar has functions for axes, such as `range(0.1, 0.4, 0.1)` and `sort(...)`. Those of
-hydra-core 1.3 give other values than are written: float ranges add up the errors of binary
-fractions, and take in the end that they exclude; sorting a range moves its values; and a cast
-forgets that its values are shuffled. The functions here give what Hydra 1.4 gives.
+hydra-core 1.3 have faults: float ranges add up rounding errors and include the stop that they
+should exclude; sorting a range changes its values; and a cast forgets that its values are to be
+shuffled. The functions here give the values that Hydra 1.4 gives.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ if TYPE_CHECKING:
     from hydra.core.config_loader import ConfigLoader
     from hydra.core.override_parser.types import Override
 
-#: The most values of a range; without its step, a range of training steps has many more.
+#: The most values of a range. A range of training steps without a step would have more.
 _MOST_VALUES = 10_000
 _CASTS = ("int", "float", "str", "bool")
 
 
 def parsed(arguments: Sequence[str], loader: ConfigLoader | None = None) -> list[Override]:
-    """Return the overrides of a command line, whose axes have the values that are written.
+    """Parse the overrides of a command line; axes have the values that the user means.
 
     Args:
         arguments: Hydra overrides.
@@ -42,15 +42,15 @@ def parsed(arguments: Sequence[str], loader: ConfigLoader | None = None) -> list
         HydraException: An override is malformed.
     """
     parser = OverridesParser.create(loader)
-    known = parser.functions.functions
-    # Under Hydra's signatures, which check the types of arguments.
-    known |= {"range": _range, "sort": _sort}
-    known |= {name: _kept_shuffled(known[name]) for name in _CASTS}
+    functions = parser.functions.functions
+    # Hydra's own signatures stay, which check the types of arguments.
+    functions |= {"range": _range, "sort": _sort}
+    functions |= {name: _kept_shuffled(functions[name]) for name in _CASTS}
     return parser.parse_overrides(list(arguments))
 
 
 def as_name(text: str) -> str:
-    """Return the name of a file, in quotes if Hydra reads no text from it: `50`, `1e3`, `true`."""
+    """Return the name of a file; in quotes if Hydra would read a number or a bool: `50`, `true`."""
     (override,) = OverridesParser.create().parse_overrides([f"name={text}"])
     if not isinstance(override.value(), bool | int | float | None):
         return text
@@ -58,7 +58,7 @@ def as_name(text: str) -> str:
 
 
 def _range(start: float, stop: float | None = None, step: float = 1) -> ChoiceSweep:
-    """Return `start`, `start + step` and so on as they are written, without `stop`."""
+    """Return `start`, `start + step` and so on in decimal arithmetic, without `stop`."""
     if stop is None:
         start, stop = 0, start
     if step == 0:
@@ -82,17 +82,19 @@ def _steps(start: Decimal, stop: Decimal, step: Decimal) -> Iterator[Decimal]:
 
 
 def _sort(*values: Any, reverse: bool = False, **named: Any) -> Any:
-    """Sort as Hydra does; what is sorted is not shuffled any more."""
-    found = grammar_functions.sort(*values, reverse=reverse, **named)
-    return replace(found, shuffle=False) if isinstance(found, ChoiceSweep) else found
+    """Sort as Hydra does; a sorted axis is no longer shuffled."""
+    result = grammar_functions.sort(*values, reverse=reverse, **named)
+    return replace(result, shuffle=False) if isinstance(result, ChoiceSweep) else result
 
 
 def _kept_shuffled(cast: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a cast of Hydra that keeps whether the values of an axis are to be shuffled."""
+
     def cast_values(*values: Any, **named: Any) -> Any:
-        found = cast(*values, **named)
-        given = values[0] if values else named.get("value")
-        if isinstance(given, ChoiceSweep):
-            found = replace(found, shuffle=given.shuffle, tags=copy(given.tags))
-        return found
+        result = cast(*values, **named)
+        axis = values[0] if values else named.get("value")
+        if isinstance(axis, ChoiceSweep):
+            result = replace(result, shuffle=axis.shuffle, tags=copy(axis.tags))
+        return result
 
     return cast_values

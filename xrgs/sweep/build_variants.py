@@ -23,8 +23,8 @@ from xrgs.safeio.sanitize import counted
 from xrgs.store import trimming
 from xrgs.store.inspect import read_report
 from xrgs.store.store import StoreGoneError
-from xrgs.sweep.jobs import worker
-from xrgs.sweep.jobs.supervise import Limits
+from xrgs.sweep import job
+from xrgs.sweep.job import Limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -47,7 +47,7 @@ class PlannedVariant:
     remembered: bool = False
     """Whether the store keeps the error, so that only `retry=failed` tries the scene again."""
     notes: tuple[str, ...] = ()
-    """What its report says, or in a dry run what the report of a new variant would say."""
+    """The notes of its report; in a dry run, the notes that a new variant's report would have."""
 
 
 def build(conf: Conf, store: Store) -> str:
@@ -58,7 +58,7 @@ def build(conf: Conf, store: Store) -> str:
         store: The store to build it in.
 
     Raises:
-        UnwritableError: The disk is full or can't be written.
+        WorkError: The build failed, or the disk is full or can't be written.
         UnreadableError: A file can't be read now.
         StoreGoneError: The store is no longer there.
         XrgsError: The photographs are missing, or can't be made into a variant.
@@ -83,29 +83,8 @@ def _build(
         work = "finding the cameras" if conf.variant.poses is None else "reading the cameras"
     log_line(f"{scenes.label(conf.scene)}: {work}{place}")
     request = {"conf": asdict(conf), "store": str(store.path)}
-    answer = worker.run_in_child("variant", request, Limits(), lambda _: check(), environment)
+    answer = job.run_in_child("variant", request, Limits(), lambda _: check(), environment)
     return str(answer["variant"])
-
-
-def restore(conf: Conf, store: Store, variant_id: str) -> None:
-    """Make the images of a trimmed variant again, in a child process.
-
-    Args:
-        conf: The config of a cell of the variant, of which only scene and variant are read.
-        store: The store.
-        variant_id: The variant's id. A variant that is not trimmed is left as it is.
-
-    Raises:
-        UnwritableError: The disk is full or can't be written.
-        UnreadableError: A file can't be read now.
-        StoreGoneError: The store is no longer there.
-        XrgsError: The photographs are missing, or give other images.
-    """
-    if not trimmed_folder(store.variants, variant_id).is_dir():
-        return
-    log_line(f"variant {variant_id}: making the images again that xrgs-store trim has removed")
-    request = {"conf": asdict(conf), "store": str(store.path), "variant": variant_id}
-    worker.run_in_child("restore", request, Limits(), lambda _: store.check_not_gone())
 
 
 def how_to_get(scenes: Iterable[SceneConf]) -> str:
@@ -117,7 +96,7 @@ def how_to_get(scenes: Iterable[SceneConf]) -> str:
         path = Path(scene.path or "")
         if path.name == scene.name and not path.exists():
             absent[scene.name] = path
-    near = {name: found for name, path in absent.items() if (found := _root_near(path))}
+    near = {name: root for name, path in absent.items() if (root := _root_near(path))}
     hints = [f"{root}/{name} is there: data_root={root}" for name, root in near.items()]
     absent = {name: path for name, path in absent.items() if name not in near}
     missing: dict[tuple[str, Path], list[str]] = {}
@@ -134,10 +113,10 @@ def how_to_get(scenes: Iterable[SceneConf]) -> str:
     ]
     hints += [f"to download what is missing: {'; '.join(commands)}"] if commands else []
     captures = {file.stem for file in (CONF_DIR / "scene/captures").glob("*.yaml")}
-    if own := [str(path) for name, path in absent.items() if name in captures]:
+    if folders := [str(path) for name, path in absent.items() if name in captures]:
         hints.append(
             "no command downloads the captures: docs/study.md says where their photographs are from"
-            f" (section Scenes); they belong into {', '.join(own)}"
+            f" (section Scenes); they belong into {', '.join(folders)}"
         )
     return "\n".join(hints)
 
@@ -145,9 +124,9 @@ def how_to_get(scenes: Iterable[SceneConf]) -> str:
 def _root_near(missing: Path) -> str:
     """Return the right `data_root`, a level below or above a wrong one; empty if there is none."""
     root, name = missing.parent, missing.name
-    found = [folder.parent for folder in sorted(root.glob(f"*/{name}")) if folder.is_dir()]
-    found += [root.parent] if root.name == name and root.is_dir() else []
-    return shlex.quote(str(found[0])) if found else ""
+    roots = [folder.parent for folder in sorted(root.glob(f"*/{name}")) if folder.is_dir()]
+    roots += [root.parent] if root.name == name and root.is_dir() else []
+    return shlex.quote(str(roots[0])) if roots else ""
 
 
 def find_or_build(conf: Conf, store: Store) -> str:
@@ -179,29 +158,29 @@ def plan(confs: Sequence[Conf], store: Store, *, allow_build: bool) -> list[Plan
     Raises:
         StoreError: The store can't be written, or is no longer there.
     """
-    known = [_outcome(_known, conf, store) for conf in confs]
-    lacking = {i: confs[i] for i, found in enumerate(known) if found is None}
+    stored = [_outcome(_stored_variant, conf, store) for conf in confs]
+    lacking = {i: confs[i] for i, planned in enumerate(stored) if planned is None}
     if allow_build:
-        made = _build_all(lacking, len(confs), store)
-    else:  # not before a build: a header may be of a file that can't be decoded, and is left out
-        made = {i: _outcome(_expected, conf, store) for i, conf in lacking.items()}
-    return [found or made[i] for i, found in enumerate(known)]
+        new = _build_all(lacking, len(confs), store)
+    else:  # not before a build, which leaves out files that have a header and can't be decoded
+        new = {i: _outcome(_unbuilt_variant, conf, store) for i, conf in lacking.items()}
+    return [planned or new[i] for i, planned in enumerate(stored)]
 
 
-def _known(conf: Conf, store: Store) -> PlannedVariant | None:
-    """Return what the store knows of a config's variant; None where it is to be built."""
+def _stored_variant(conf: Conf, store: Store) -> PlannedVariant | None:
+    """Return a config's variant, or its failure, from the store; None where it is to be built."""
     key = variant.key(conf.scene, conf.variant)
     frozen = variant.find(store.variants, key)
     if frozen is not None:
-        return _found(conf, store, frozen.id, store.variants / frozen.id)
+        return _with_notes(conf, store, frozen.id, store.variants / frozen.id)
     # The done cells of a trimmed variant are found by its id; a job that trains another cell makes
     # the images again.
     if trimmed := trimming.trimmed_variant(store.variants, key):
-        return _found(conf, store, trimmed, trimmed_folder(store.variants, trimmed))
+        return _with_notes(conf, store, trimmed, trimmed_folder(store.variants, trimmed))
     return None if conf.retry == "failed" else _failed_before(store, key)
 
 
-def _expected(conf: Conf, store: Store) -> PlannedVariant:
+def _unbuilt_variant(conf: Conf, store: Store) -> PlannedVariant:
     """Return a variant that a dry run does not build, with the notes that it would have."""
     return PlannedVariant(notes=_expected_notes(conf, store))
 
@@ -213,7 +192,7 @@ def _build_all(lacking: Mapping[int, Conf], total: int, store: Store) -> dict[in
 
     Args:
         lacking: Configs by their place among all variants of the sweep.
-        total: How many these are.
+        total: Number of variants of the sweep.
         store: The store.
     """
     cores = usable_cores()
@@ -226,7 +205,7 @@ def _build_all(lacking: Mapping[int, Conf], total: int, store: Store) -> dict[in
     def check() -> None:
         store.check_not_gone()
         if ended.is_set():
-            raise worker.InterruptedWorkError("the sweep has ended")
+            raise job.WorkError("the sweep has ended", job.STOPPED)
 
     def build_one(i: int, conf: Conf, store: Store) -> PlannedVariant:
         place = f" {i + 1} of {total}" if total > 1 else ""
@@ -257,8 +236,6 @@ def _outcome(
     """
     try:
         return work(conf, store)
-    except worker.UnwritableError as error:
-        raise StoreError(f"store={store.path}: {error}. {worker.NOTHING_LOST}") from error
     except StoreGoneError:
         raise
     except OSError as error:
@@ -266,6 +243,8 @@ def _outcome(
             raise
         return PlannedVariant(error=str(error))
     except XrgsError as error:
+        if isinstance(error, job.WorkError) and error.outcome == job.UNWRITABLE:
+            raise StoreError(f"store={store.path}: {error}. {job.NOTHING_LOST}") from error
         if building:
             store.check_not_gone()
             # COLMAP dies of a full disk without saying so. The scene is not at fault then.
@@ -290,13 +269,13 @@ def _failed_before(store: Store, key: str) -> PlannedVariant | None:
     return PlannedVariant(error=failure, remembered=True, notes=notes)
 
 
-def _found(conf: Conf, store: Store, variant_id: str, folder: Path) -> PlannedVariant:
+def _with_notes(conf: Conf, store: Store, variant_id: str, folder: Path) -> PlannedVariant:
     """Return a variant that was built before, with the notes of its report.
 
-    Files that came into the scene's folder since then, as a store, are left out and said too.
+    Files that have come into the scene's folder since, for example a store, have notes too.
     """
-    now = _scene(conf, store).notes if conf.scene.kind == "folder" else ()
-    return PlannedVariant(variant_id, notes=tuple(dict.fromkeys((*now, *_notes(folder)))))
+    notes = _scene(conf, store).notes if conf.scene.kind == "folder" else ()
+    return PlannedVariant(variant_id, notes=tuple(dict.fromkeys((*notes, *_notes(folder)))))
 
 
 def _scene(conf: Conf, store: Store) -> scenes.Scene:
@@ -305,7 +284,7 @@ def _scene(conf: Conf, store: Store) -> scenes.Scene:
 
 
 def _notes(folder: Path) -> tuple[str, ...]:
-    """Return what the report of a variant, or of a scene that failed, says of its photographs.
+    """Return the notes on photographs in the report of a variant, or of a scene that failed.
 
     Raises:
         UnreadableError: The report can't be read now.
@@ -319,7 +298,7 @@ def _notes(folder: Path) -> tuple[str, ...]:
 
 
 def _expected_notes(conf: Conf, store: Store) -> tuple[str, ...]:
-    """Say what a variant of photographs would leave out, from their names and headers alone.
+    """Return the notes that a variant would have, from the names and headers of photographs.
 
     Raises:
         UnreadableError: A photograph can't be read now.
@@ -335,30 +314,31 @@ def _expected_notes(conf: Conf, store: Store) -> tuple[str, ...]:
     _check_held_out(names, conf, notes)
     parts = split.split_before_sfm(names, sizes, conf.variant)
     if conf.scene.kind == "folder":
-        notes.append(_what_becomes_of_them(parts, conf.variant))
+        notes.append(_use_of_photographs(parts, conf.variant))
     return *notes, *split.split_notes(parts, conf.variant)
 
 
-def _what_becomes_of_them(parts: split.Split, conf: VariantConf) -> str:
+def _use_of_photographs(parts: split.Split, conf: VariantConf) -> str:
     """Say how many photographs are held out, trained on, and degraded."""
-    trained, tests, way = len(parts.hr) + len(parts.lr), len(parts.test), resolve_degradation(conf)
-    said = f"{counted(trained + tests, 'photograph')}: {tests} held out, {trained} to train on"
-    if way == "none" or not parts.lr:
-        return f"{said}, as they are"
-    smaller = way in DEGRADATIONS and DEGRADATIONS[way].smaller
-    made = f"made {conf.factor} times smaller" if smaller else f"degraded by {way}"
-    lr = f"{len(parts.lr)} of which are {made}"
-    return f"{said}, {lr}; variant.hr_fraction=1 leaves them as they are"
+    trained, tests = len(parts.hr) + len(parts.lr), len(parts.test)
+    degradation = resolve_degradation(conf)
+    uses = f"{counted(trained + tests, 'photograph')}: {tests} held out, {trained} to train on"
+    if degradation == "none" or not parts.lr:
+        return f"{uses}, as they are"
+    smaller = degradation in DEGRADATIONS and DEGRADATIONS[degradation].smaller
+    change = f"made {conf.factor} times smaller" if smaller else f"degraded by {degradation}"
+    lr = f"{len(parts.lr)} of which are {change}"
+    return f"{uses}, {lr}; variant.hr_fraction=1 leaves them as they are"
 
 
 def _check_held_out(names: Sequence[str], conf: Conf, notes: Iterable[str] = ()) -> None:
-    """Refuse photographs of which too few are trained on, or none tested, even if all are placed.
+    """Refuse a split with too few photographs to train on, or none to test, though all be placed.
 
     Args:
         names: The names of the photographs, sorted. Some may turn out to be unreadable, and leave
             even fewer.
         conf: A cell's config.
-        notes: What else is said of the photographs.
+        notes: Notes on the photographs, for the end of the message.
 
     Raises:
         XrgsError: There are too few; the message says what helps.

@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 
 #: What `gc` removes, by the names that choose it.
 GARBAGE = ("old_code", "failed", "aside", "variants")
-#: Folders in `cells/` and `variants/` that were set aside, and that a killed removal has left. The
-#: groups are the name of the lease.
+#: Names of folders in `cells/` and `variants/` that were set aside, or that a killed removal has
+#: left. Either group is the id of the cell, which is also the name of its lease.
 _ASIDE = re.compile(r"\.?(?P<id>[^.]+)\.aside-\d+|\.(?P<rest>[^.]+)\.new-[0-9a-f]+")
 #: Seconds for which a new variant is kept without a cell: a sweep may be about to begin one.
 _NEW_S = 3600.0
@@ -53,9 +53,9 @@ class Item:
     """Its name for people."""
     bytes: int
     lease: str | None
-    """The name of the lease to hold while it is removed; None for none."""
+    """The name of the lease to hold while it is removed; None where it needs no lease."""
     act: Callable[[], str | None]
-    """Removes it; returns why it was left, if it was."""
+    """Removes the thing; returns the reason where it is left."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Plan:
     """`remove` or `trim`."""
     items: tuple[Item, ...]
     notes: tuple[str, ...] = ()
-    """Lines on what is left alone, and why."""
+    """Lines on things that are left alone, with the reasons."""
 
     @property
     def total(self) -> str:
@@ -162,14 +162,14 @@ def plan_gc(store: Store, cells: Sequence[CellRow], of: Sequence[str]) -> Plan:
             items += _folders("folders that were set aside", aside, leased=leased)
     notes = [*_recorded([cell for cell in cells if cell.id in gone])]
     if "variants" in of:
-        found, why = _orphans(store, cells, gone)
-        items += found
-        notes += why
+        orphans, left_alone = _orphans(store, cells, gone)
+        items += orphans
+        notes += left_alone
     return Plan("remove", tuple(items), tuple(notes))
 
 
 def carry_out(store: Store, plan: Plan) -> tuple[int, list[str]]:
-    """Remove what a plan lists; an item that can't be removed hides no other.
+    """Remove the items of a plan; one that can't be removed does not keep the others.
 
     Returns:
         The number of bytes that were freed, and a line for each item that was left, with the
@@ -250,10 +250,10 @@ def _paths(folder: Path) -> list[Path]:
 def _folders(kind: str, paths: Iterable[Path], *, leased: bool = False) -> Iterator[Item]:
     """Yield folders to remove; with `leased`, each under the lease that its name contains."""
     for folder in paths:
-        found = _ASIDE.fullmatch(folder.name) if leased else None
-        held = (found["id"] or found["rest"]) if found else None
+        match = _ASIDE.fullmatch(folder.name) if leased else None
+        lease_name = (match["id"] or match["rest"]) if match else None
         name, size = f"{folder.parent.name}/{folder.name}", size_of(folder) or 0
-        yield Item(kind, name, size, held, partial(remove_path, folder))
+        yield Item(kind, name, size, lease_name, partial(remove_path, folder))
 
 
 def _orphans(

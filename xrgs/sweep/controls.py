@@ -53,10 +53,10 @@ def check_effect(combinations: Iterable[CellSpec], plan: Iterable[PlannedCell]) 
                 f"matched_to=null: {cell.spec.label} takes a number of Gaussians; name the ablation"
                 " that it takes it from"
             )
-    wanted = {spec.matched_to: None for spec in combinations if spec.matched_to is not None}
-    found = {cell.conf.matched_to for cell in plan}
-    for name in wanted:
-        if name not in found:
+    asked_for = {spec.matched_to: None for spec in combinations if spec.matched_to is not None}
+    planned = {cell.conf.matched_to for cell in plan}
+    for name in asked_for:
+        if name not in planned:
             raise XrgsError(
                 f"matched_to={name}: no ablation of this sweep takes a number of Gaussians; add"
                 " count_matched to +ablation, or set matched_to=null"
@@ -67,7 +67,7 @@ def mixed_prune_rules(plan: Sequence[PlannedCell]) -> list[str]:
     """Return a line for each label whose controls prune by another rule than their references.
 
     The rule (`splat.densify.prune_scale3d`) changes scores and counts more than most ablations, and
-    would hide what is to be compared.
+    would hide the difference that is to be measured.
     """
     cells = {cell.spec: cell for cell in plan}
     lines: dict[str, None] = {}
@@ -76,10 +76,10 @@ def mixed_prune_rules(plan: Sequence[PlannedCell]) -> list[str]:
         if reference is None:
             continue
         splats = [c.conf.splat for c in (cell, reference)]
-        own, other = (splat.densify.prune_scale3d for splat in splats)
-        if own != other and all(splat.strategy == "default" for splat in splats):
+        here, there = (splat.densify.prune_scale3d for splat in splats)
+        if here != there and all(splat.strategy == "default" for splat in splats):
             line = (
-                f"{cell.spec.label}: splat.densify.prune_scale3d is {own:g} here and {other:g} in"
+                f"{cell.spec.label}: splat.densify.prune_scale3d is {here:g} here and {there:g} in"
                 f" {reference.spec.label}, so that they differ in more than what is to be"
                 " controlled for; the ablation keep_large sets it to 10"
             )

@@ -1,4 +1,4 @@
-"""What a run says last: its cells, and the commands that lead on."""
+"""Writes the end of a run's output: its done cells, and the commands that come next."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ if TYPE_CHECKING:
 
 #: The most cells that are listed with their ids.
 _MAX_LISTED = 12
-#: The characters of an id that name a cell in a command.
+#: Number of characters of a cell's id in a command.
 _ID = 8
 
 
 def ending(plan: Sequence[PlannedCell], store: Path) -> str:
-    """Return what a sweep says after its report: the ids of its done cells, and what comes next.
+    """Return the text after a sweep's report: the ids of its done cells, and commands to go on.
 
     Args:
         plan: The cells of the sweep, after it has ended.
@@ -49,7 +49,7 @@ def next_commands(cells: Sequence[str], name: str, store: Path) -> list[str]:
 
     Args:
         cells: One cell or two of one variant, as a command takes them.
-        name: What the files are called, without a suffix.
+        name: Name of the files, without a suffix.
         store: The folder of the store.
     """
     words = shlex.join(cells)

@@ -2,8 +2,8 @@
 
 The config of the nearest cells differs in the fewest keys; another variant, processor or backend
 counts as several keys. Time, memory and disk of such a cell are scaled by the pixels of a view, and
-its time by the steps and threads too. Of several equally near cells the median counts. A store
-without finished cells gives no estimate.
+its time by the steps and threads too. The median of equally near cells is taken. A store without
+finished cells gives no estimate.
 """
 
 from __future__ import annotations
@@ -31,9 +31,10 @@ if TYPE_CHECKING:
     from xrgs.store.cell_folder import CellFolder
     from xrgs.store.store import Store
 
-#: Gaussians of a cell for each pixel of its largest view, mean over the steps, where no finished
-#: cell tells. In least squares of 111 cells of 2,000 steps at 500 px on one thread of an AMD EPYC
-#: (November 2026), a rendered pixel took 290 ns of a step and a Gaussian 344 ns: both count alike.
+#: Assumed Gaussians of a cell for each pixel of its largest view, mean over the steps, while the
+#: store has no finished cell. In least squares of 111 cells of 2,000 steps at 500 px on one thread
+#: of an AMD EPYC (November 2026), a rendered pixel took 290 ns of a step and a Gaussian 344 ns:
+#: both count alike.
 GAUSSIANS_OF_A_PIXEL = 0.5
 #: Number of finished cells that are read, the newest first; more would take long and help little.
 _MAX_CELLS = 500
@@ -60,7 +61,7 @@ class Cost:
     """Size of its files when it is done."""
 
     def left_s(self, trained: float) -> float:
-        """Return the seconds to the end of a cell, with this share of its training done."""
+        """Return the seconds to the end of a cell of whose training this share is done."""
         return (1 - trained) * (self.seconds - self.scoring_s) + self.scoring_s
 
 
@@ -152,7 +153,7 @@ class CostEstimator:
         if variant_id is not None:
             with suppress(StoreError):
                 pixels = _pixels(self._store.variants, variant_id, conf)[0]
-        # Of a variant that is not built yet, the views of the cell's own variant are taken.
+        # While the variant is not built, the views of the finished cell's variant are taken.
         costs = [_scaled(past, conf, pixels or past.pixels, threads, backend) for past in nearest]
         return Cost(*(median(values) for values in zip(*map(astuple, costs), strict=True)))
 
@@ -175,7 +176,7 @@ def _settings(conf: Conf) -> frozenset[tuple[str, str]]:
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Yield each of nested values with its key, as `splat.densify.every`."""
+    """Yield each value of nested dicts with its dotted key, as `splat.densify.every`."""
     for key, value in values.items():
         if isinstance(value, dict):
             yield from _flat(value, f"{prefix}{key}.")
@@ -197,7 +198,7 @@ def read_views(variants: Path, variant_id: str) -> tuple[ViewEntry, ...]:
 
 
 def _pixels(variants: Path, variant_id: str, conf: Conf) -> tuple[float, int]:
-    """Return the pixels that a cell renders, mean over the steps, and those of its largest view.
+    """Return the pixels of a cell's render, mean over the steps, and of its largest view.
 
     Raises:
         StoreError: The variant's list of views can't be read, or has none that is trained on.
@@ -227,7 +228,8 @@ def _pixels(variants: Path, variant_id: str, conf: Conf) -> tuple[float, int]:
     share = len(hr) / len(by_name)
     if hr and lr:
         share = max(share, conf.train.hr_share)
-    mean = sum(drawn * fmean(of) for of, drawn in ((hr, share), (lr, 1 - share)) if of)
+    classes = ((hr, share), (lr, 1 - share))
+    mean = sum(weight * fmean(pixels) for pixels, weight in classes if pixels)
     return mean, largest
 
 

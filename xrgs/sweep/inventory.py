@@ -112,8 +112,8 @@ def show(store: Store, cell: CellRow) -> str:
         "files": _files(cell.folder),
     }
     lines: list[str] = []
-    for title, found in sections.items():
-        body = list(found)
+    for title, section in sections.items():
+        body = list(section)
         if body:
             lines += [f"{title}:", *(f"  {line}" for line in body)] if title else body
     return "\n".join(for_line(line) for line in lines)
@@ -162,10 +162,10 @@ def _scores(folder: CellFolder) -> Iterator[str]:
 
 def _provenance(folder: CellFolder) -> Iterator[str]:
     try:
-        found = msgspec.structs.asdict(folder.provenance())
+        provenance = msgspec.structs.asdict(folder.provenance())
     except StoreError:
         return
-    yield from (f"{key}: {_short(found[key])}" for key in _PROVENANCE if found[key])
+    yield from (f"{key}: {_short(provenance[key])}" for key in _PROVENANCE if provenance[key])
 
 
 def _files(folder: CellFolder) -> Iterator[str]:

@@ -1,7 +1,7 @@
 """Shows a running sweep in one line: how many cells are done, the speed, and the time left.
 
-The monitor reads the store's files alone, so that it works with any launcher, on any machine: a
-cell that has ended has a status file, and a cell in training has a progress file.
+The monitor only reads the store's files, so that it works with any launcher, on any machine: a cell
+that has ended has a status file, and a cell in training has a progress file.
 """
 
 from __future__ import annotations
@@ -32,15 +32,17 @@ if TYPE_CHECKING:
     from xrgs.runtime.progress import Progress
     from xrgs.sweep.plan import PlannedCell
 
-#: Seconds between two snapshots, at least; and the pause in multiples of the time that a snapshot
-#: takes, so that a slow store is not kept busy.
-_POLL_S, _PAUSE_FACTOR = 1.0, 20
-#: The least share of a cell's training from which its speed is judged: it has few Gaussians first.
+#: Least seconds between two snapshots.
+_POLL_S = 1.0
+#: The pause after a snapshot is at least this many times as long as the snapshot took, so that a
+#: slow store is not kept busy.
+_PAUSE_FACTOR = 20
+#: The speed of a cell is judged from this share of its training on: before, it has few Gaussians.
 _JUDGED = 0.25
-#: A log gets a line when a cell has ended, and after so many seconds without one.
+#: A log gets a line when a cell has ended, and at the latest this many seconds after the last line.
 _LINE_S = 600.0
-#: A cell whose progress file has not changed for so many seconds is not running: its process died
-#: together with the one that started it.
+#: A cell whose progress file has not changed for this many seconds is not running: its process has
+#: died, and so has the process that started it.
 _SILENT_S = 120.0
 
 #: Inode and modification time of a file, which change when it is written again; None if absent.
@@ -85,8 +87,8 @@ class SweepSnapshot:
     slowness: float = 1.0
     """The time that this sweep's cells took, relative to their estimates."""
     shares: Mapping[str, float] = field(default_factory=dict)
-    """The share of its steps that each cell had done when it was last seen in training. A cell has
-    no progress file for a moment before it is done, and then waits by its files."""
+    """The share of its steps that each cell had done when it was last seen in training. For a
+    moment before it is done a cell has no progress file, and looks as if it waited."""
 
     @property
     def ended(self) -> int:
@@ -102,13 +104,13 @@ class SweepSnapshot:
     def left_s(self) -> float | None:
         """Expected seconds left, if as many cells run at once as did so far; None if unknown."""
         waiting = (self.expected_s(cell, self.trained(cell)) for cell in self.waiting)
-        own = [*waiting, *map(self.rest_s, self.running)]
-        known = [seconds for seconds in own if seconds is not None]
-        if len(known) < len(own):
+        ours = [*waiting, *map(self.rest_s, self.running)]
+        estimates = [seconds for seconds in ours if seconds is not None]
+        if len(estimates) < len(ours):
             return None
         others = [seconds for cell in self.elsewhere if (seconds := self.rest_s(cell))]
-        longest = max([*known, *others], default=None)
-        return longest and max(longest, sum(known) / self.at_once)
+        longest = max([*estimates, *others], default=None)
+        return longest and max(longest, sum(estimates) / self.at_once)
 
     @property
     def progress(self) -> float:
@@ -133,13 +135,13 @@ class SweepSnapshot:
 
     def rest_s(self, running: RunningCell) -> float | None:
         """Return the expected seconds to the end of a running cell; None if unknown."""
-        cost, past = running.cell.cost, self.expected_s(running.cell, running.share)
-        own = running.progress.remaining_s if running.trains else None
-        if own is None or past is None or cost is None:
-            return past if own is None else own
-        # A cell's own pace says little at first, when it has few Gaussians, and all at the end.
+        cost, by_store = running.cell.cost, self.expected_s(running.cell, running.share)
+        by_pace = running.progress.remaining_s if running.trains else None
+        if by_pace is None or by_store is None or cost is None:
+            return by_store if by_pace is None else by_pace
+        # A cell's own pace misleads at first, when it has few Gaussians, and is right at the end.
         scoring = cost.scoring_s * self.slowness
-        return (1 - running.share) * past + running.share * (own + scoring)
+        return (1 - running.share) * by_store + running.share * (by_pace + scoring)
 
     def __str__(self) -> str:
         parts = [f"{self.done} of {self.total} cells done"]
@@ -155,16 +157,17 @@ class SweepSnapshot:
         return ", ".join(parts)
 
     @property
-    def of_one(self) -> str:
-        """The state of a single training, without the words of a study."""
+    def brief(self) -> str:
+        """The state of a single training: its count, speed and time left, without cells."""
         counts = [cell.progress.count for cell in self.running] or ["training"]
         return ", ".join([*counts, *self._pace_and_rest()])
 
     def _pace_and_rest(self) -> list[str]:
         rate = sum(1 / cell.pace for cell in self.running if cell.pace)
-        said = [f"{rate:.3g} steps/s"] if rate else []
-        left = self.left_s
-        return said if left is None else [*said, f"{format_duration(left)} left"]
+        parts = [f"{rate:.3g} steps/s"] if rate else []
+        if self.left_s is not None:
+            parts.append(f"{format_duration(self.left_s)} left")
+        return parts
 
 
 class _Slowness:
@@ -209,7 +212,7 @@ class SweepMonitor:
 
         Args:
             cells: The folder.
-            brief: Show how far a single training is, without the words of a study.
+            brief: Show a single training, see `SweepSnapshot.brief`.
         """
         self._cells, self._brief = cells, brief
         self._plan: tuple[PlannedCell, ...] = ()
@@ -219,7 +222,7 @@ class SweepMonitor:
         self._ended: dict[str, str] = {}
         """States of the cells that have ended since."""
         self._moved: dict[str, tuple[_FileStamp, float]] = {}
-        """The progress file of each cell, and when it was first seen like that."""
+        """The stamp of each cell's progress file, and when this stamp was first seen."""
         self._pace: float | None = None
         self._shares: dict[str, float] = {}
         """The share of its steps that each cell has done, when it was last seen in training."""
@@ -327,25 +330,24 @@ class SweepMonitor:
             folder = self._folder(name)
             if (status := _stamp(folder.status_file)) is None or status == self._before[name]:
                 return ""
-            found = folder.state(verify=False)
-            if found.unreadable:  # it is read again
+            state = folder.state(verify=False)
+            if state.unreadable:  # it is read again
                 return ""
-            state = found.name
-            if state == "done":
+            if state.name == "done":
                 self._slowness.end(cell)
-            self._ended[name] = "done" if state == "done" else "failed"
+            self._ended[name] = "done" if state.name == "done" else "failed"
         return self._ended[name]
 
     def _progress(self, cell: PlannedCell, begun: set[str]) -> Progress | None:
         if cell.cell_id is None or cell.cell_id not in begun:
             return None
         file = self._folder(cell.cell_id).progress
-        stamp, known = _stamp(file), self._moved.get(cell.cell_id)
+        stamp, seen = _stamp(file), self._moved.get(cell.cell_id)
         if stamp is None:
             return None
-        if known is None or known[0] != stamp:
-            self._moved[cell.cell_id] = known = (stamp, time.monotonic())
-        return None if time.monotonic() - known[1] > _SILENT_S else progress.read(file)
+        if seen is None or seen[0] != stamp:
+            self._moved[cell.cell_id] = seen = (stamp, time.monotonic())
+        return None if time.monotonic() - seen[1] > _SILENT_S else progress.read(file)
 
     def _watch(self) -> None:
         pause = _POLL_S
@@ -369,13 +371,13 @@ class SweepMonitor:
         if self._bar is None:
             style = "{percentage:3.0f}%|{bar:20}| {desc}"
             self._bar = tqdm(None, bar_format=style, leave=False, dynamic_ncols=True, delay=1e-9)
-        # A training that starts again, as count_matched does, takes nothing back.
+        # Where a training starts again, as with count_matched, the bar stays where it was.
         shown = self._bar.n if self._bar.total == snapshot.total else 0
         self._bar.total, self._bar.n = snapshot.total, max(shown, snapshot.progress)
         self._bar.set_description_str(self._text(snapshot))
 
     def _text(self, snapshot: SweepSnapshot) -> str:
-        return snapshot.of_one if self._brief else str(snapshot)
+        return snapshot.brief if self._brief else str(snapshot)
 
 
 def _stamp(file: Path) -> _FileStamp:

@@ -7,17 +7,19 @@ from typing import TYPE_CHECKING
 
 from xrgs.errors import XrgsError
 from xrgs.mixture.paths import TO_TRY
+from xrgs.mixture.split import check_variant_conf
 from xrgs.photos import scenes
 from xrgs.runtime.machine import usable_memory
 from xrgs.runtime.text import format_duration, format_size
 from xrgs.safeio.hashing import digest, to_plain
 from xrgs.safeio.sanitize import counted, for_line
 from xrgs.splat.backend import resolve_backend
+from xrgs.splat.settings import SSIM_WINDOW
 from xrgs.store.cell_folder import CellState
 from xrgs.store.identity import cell_id, cell_identity
 from xrgs.store.schema import RecordedCell
 from xrgs.store.store import BASELINE
-from xrgs.sweep.build_variants import how_to_get
+from xrgs.sweep import build_variants
 from xrgs.sweep.estimate import TORCH_SLOWDOWN
 
 if TYPE_CHECKING:
@@ -98,21 +100,67 @@ class PlannedCell:
 
 
 def planned(spec: CellSpec, conf: Conf) -> PlannedCell:
-    """Return a planned cell; add to label and condition what only the config tells.
+    """Return a planned cell, with two additions from its config.
 
-    The label names the reference of a count-matched cell. The condition names the scored
-    views if they are not test views, so that nobody takes their scores for scores of test views.
+    The label of a count-matched cell gets the name of its reference. The condition gets the scored
+    views where these are not test views, so that nobody takes their scores for those of test views.
     """
-    said = spec.condition
+    scored = ""
     if conf.train.validation:
-        key = "train.validation="
-        said = said if key in said else f"{said} {key}{conf.train.validation}"
-    elif conf.variant.test_every == 0 and not conf.variant.test and _ON_TRAINING_VIEWS not in said:
-        said = f"{said} {_ON_TRAINING_VIEWS}"
-    spec = replace(spec, condition=said.lstrip())
+        if "train.validation=" not in spec.condition:
+            scored = f"train.validation={conf.train.validation}"
+    elif conf.variant.test_every == 0 and not conf.variant.test:
+        scored = "" if _ON_TRAINING_VIEWS in spec.condition else _ON_TRAINING_VIEWS
+    spec = replace(spec, condition=f"{spec.condition} {scored}".strip())
     if conf.matched_to is not None:
         spec = replace(spec, label=f"{spec.label} to {conf.matched_to}")
     return PlannedCell(spec, conf)
+
+
+def check_sizes(conf: Conf) -> None:
+    """Refuse a config with images too small for SSIM, or with invalid values of its variant.
+
+    Raises:
+        XrgsError: A value is out of its range; the message names the key.
+    """
+    check_variant_conf(conf.variant)
+    side, least = conf.variant.long_side, conf.variant.factor * SSIM_WINDOW
+    if 0 < side < least:
+        raise XrgsError(
+            f"variant.long_side={side}: must be 0 (the photographs' size) or at least {least}, so"
+            f" that LR views have the {SSIM_WINDOW} px a side that SSIM needs"
+        )
+
+
+def with_variants(
+    plan: Sequence[PlannedCell], store: Store, *, allow_build: bool
+) -> tuple[list[PlannedCell], list[str]]:
+    """Return the cells with their variants, or with the reasons why there are none.
+
+    Args:
+        plan: The cells.
+        store: The store.
+        allow_build: Build the variants that the store lacks; False for a dry run.
+
+    Returns:
+        The cells, and the notes on the variants, each with its scene.
+
+    Raises:
+        StoreError: The store can't be written, or is no longer there.
+    """
+    keys = [digest([to_plain(cell.conf.scene), to_plain(cell.conf.variant)]) for cell in plan]
+    confs = {key: cell.conf for key, cell in zip(keys, plan, strict=True)}
+    built = build_variants.plan([*confs.values()], store, allow_build=allow_build)
+    variants = dict(zip(confs, built, strict=True))
+    notes: dict[str, None] = {}
+    cells = []
+    for key, cell in zip(keys, plan, strict=True):
+        variant = variants[key]
+        cells.append(
+            replace(cell, variant_id=variant.id, error=variant.error, remembered=variant.remembered)
+        )
+        notes |= dict.fromkeys(f"{scenes.label(cell.conf.scene)}: {n}" for n in variant.notes)
+    return cells, list(notes)
 
 
 def with_wanted_baselines(plan: Sequence[PlannedCell]) -> list[PlannedCell]:
@@ -157,7 +205,7 @@ def identified(cell: PlannedCell, store: Store, holders: Mapping[str, str]) -> P
 
 
 def estimated(plan: Sequence[PlannedCell], past: CostEstimator, threads: int) -> list[PlannedCell]:
-    """Return the cells with their costs, as far as known.
+    """Return the cells with their expected costs, where the store has finished cells to compare.
 
     Args:
         plan: The cells.
@@ -208,13 +256,13 @@ def describe(plan: Sequence[PlannedCell]) -> str:
     """
     done = sum(cell.state.name == "done" for cell in plan)
     lines = [f"plan: {counted(len(plan), 'cell')}, {done} done{_remaining(plan)}"]
-    said = set[str]()
+    reasons = set[str]()
     for cell in plan:
         state, reason = _shown_state(cell)
-        if reason in said:
+        if reason in reasons:
             reason = "the same"
         elif reason:
-            said.add(reason)
+            reasons.add(reason)
         cell_id = cell.cell_id or ("no count yet" if state == "waits" else "variant not built")
         to_train = not cell.error and state != "done"
         time_left = format_duration(cell.seconds) if to_train else ""
@@ -225,7 +273,7 @@ def describe(plan: Sequence[PlannedCell]) -> str:
         lines.append("failed cells are not trained again; retry=failed trains them again")
     if any(cell.not_placed for cell in plan):
         lines += TO_TRY
-    if hint := how_to_get([cell.conf.scene for cell in plan if cell.error]):
+    if hint := build_variants.how_to_get([cell.conf.scene for cell in plan if cell.error]):
         lines.append(hint)
     return "\n".join(map(for_line, lines))
 
@@ -247,9 +295,9 @@ def without_kernels(plan: Sequence[PlannedCell]) -> str:
     ]
     if not cells:
         return ""
-    known = [cell.seconds for cell in cells if cell.seconds is not None]
-    torch, native = (format_duration(sum(known) / ratio) for ratio in (1.0, TORCH_SLOWDOWN))
-    complete = len(known) == len(cells)
+    estimates = [cell.seconds for cell in cells if cell.seconds is not None]
+    torch, native = (format_duration(sum(estimates) / ratio) for ratio in (1.0, TORCH_SLOWDOWN))
+    complete = len(estimates) == len(cells)
     instead = f"{torch} instead of {native}" if complete else "30 to 60 times longer"
     return (
         "the kernels were not built on this machine: torch trains"
@@ -313,12 +361,12 @@ def left_to_train(plan: Sequence[PlannedCell]) -> list[PlannedCell]:
 def _remaining(plan: Sequence[PlannedCell]) -> str:
     """Return the expected time of the remaining training, as far as known."""
     remaining = left_to_train(plan)
-    known = [cell.seconds for cell in remaining if cell.seconds is not None]
-    if not known:
+    estimates = [cell.seconds for cell in remaining if cell.seconds is not None]
+    if not estimates:
         return ""
-    unknown = len(remaining) - len(known)
+    unknown = len(remaining) - len(estimates)
     more = f" and {counted(unknown, 'cell')} without an estimate" if unknown else ""
-    return f"; left to train, one after another: {format_duration(sum(known))}{more}"
+    return f"; left to train, one after another: {format_duration(sum(estimates))}{more}"
 
 
 def record(plan: Sequence[PlannedCell]) -> list[RecordedCell]:

@@ -1,4 +1,4 @@
-"""Trains a finished cell again from its folder alone, and compares the results.
+"""Trains a finished cell again from nothing but its folder, and compares the results.
 
 The cell's config says how to train, and its identity names the variant to train on. Differences of
 the program, its libraries and the machine are reported before the training: they explain other
@@ -28,10 +28,9 @@ from xrgs.store.attempts import begin_attempt, plan_cell
 from xrgs.store.cell_folder import CellFolder
 from xrgs.store.identity import cell_identity
 from xrgs.store.store import Store
-from xrgs.sweep import build_variants
+from xrgs.sweep import build_variants, job
 from xrgs.sweep.axes import CellSpec
 from xrgs.sweep.estimate import Cost
-from xrgs.sweep.jobs import worker
 from xrgs.sweep.monitor import SweepMonitor
 from xrgs.sweep.plan import PlannedCell
 
@@ -45,7 +44,7 @@ if TYPE_CHECKING:
 _RESULTS = ("scores.csv", "history.csv", "splats.ply")
 #: Figures of the summary that are compared; times and memory differ from run to run.
 _COUNTS = ("steps", "gaussians", "evaluations", "grow_grad2d")
-#: The most characters of a value that differs.
+#: A value that differs is cut to this many characters.
 _MAX_VALUE = 60
 
 
@@ -90,7 +89,7 @@ def rerun(
             should depend on it.
         photographs: Replaces the config's `scene.path`, if the variant has to be built.
         plugins: Names of the components of other packages that may be imported. A cell that needs
-            another one is refused: a store must not decide what is imported.
+            another one is refused: a store must not decide which code is imported.
 
     Returns:
         The comparison.
@@ -99,46 +98,32 @@ def rerun(
         XrgsError: The folder has no finished cell, or a config with unknown keys; the variant is
             missing and can't be built again; or the training failed.
     """
+    original = CellFolder(folder)
     try:
-        return _rerun(folder, out, store, threads, photographs, plugins)
+        conf, added = _read(original)
+        _check_plugins_allowed(original, conf, plugins)
+        home = Store(store or _store_of(folder))
+        conf.threads = original.provenance().threads if threads is None else threads
+        conf.scene.path = photographs or conf.scene.path
+        if conf.threads < 0:
+            raise XrgsError(f"threads={conf.threads}: must be at least 0")
+        repeated = CellFolder(_free_folder(out, folder))
+        conf.splat.backend = resolve_backend(conf.splat.backend)
+        variant_id = original.identity().variant
+        identity = cell_identity(conf, variant_id)
+        before = [*_differences_before(original, conf, added, identity)]
+        title = "differences from when the cell was trained"
+        for line in _listed(before, title) or ["code, libraries and machine are the same"]:
+            log_line(line)
+        _provide(variant_id, conf, home)
+        _train_again(conf, home.variants / variant_id, repeated, identity, original)
+        return RerunResult(repeated, before, [*_differences(original, repeated)])
     except OSError as error:
         raise XrgsError(f"rerun={folder}: {error}") from error
 
 
-def _rerun(
-    folder: Path,
-    out: Path | None,
-    store: Path | None,
-    threads: int | None,
-    photographs: str | None,
-    plugins: Sequence[str],
-) -> RerunResult:
-    original = CellFolder(folder)
-    conf, identity, added = _read(original)
-    _check_plugins_allowed(original, conf, plugins)
-    home = Store(store or _store_of(folder))
-    conf.threads = conf.threads if threads is None else threads
-    conf.scene.path = photographs or conf.scene.path
-    if conf.threads < 0:
-        raise XrgsError(f"threads={conf.threads}: must be at least 0")
-    repeated = CellFolder(_free_folder(out, folder))
-    conf.splat.backend = resolve_backend(conf.splat.backend)
-    now = cell_identity(conf, identity.variant)
-    before = [
-        *_newer_keys(added),
-        *_damage(original),
-        *_other_program(original, conf, now),
-    ]
-    title = "differences from when the cell was trained"
-    for line in _listed(before, title) or ["code, libraries and machine are the same"]:
-        log_line(line)
-    _provide(identity.variant, conf, home)
-    _train_again(conf, home.variants / identity.variant, repeated, now, original)
-    return RerunResult(repeated, before, [*_differences(original, repeated)])
-
-
-def _read(original: CellFolder) -> tuple[Conf, Identity, dict[str, Any]]:
-    """Return the cell's config, with the threads of its training, its identity, and added keys."""
+def _read(original: CellFolder) -> tuple[Conf, dict[str, Any]]:
+    """Return the config of a finished cell, and the keys that are newer than it."""
     if not original.path.is_dir():
         raise XrgsError(f"rerun={original.path}: there is no such folder")
     for name in ("config.json", "identity.json", "provenance.json", "status.json"):
@@ -148,9 +133,7 @@ def _read(original: CellFolder) -> tuple[Conf, Identity, dict[str, Any]]:
     if state.name == "failed":
         reason = state.reason.partition("\n")[0]
         raise XrgsError(f"rerun={original.path}: the cell failed and has no results ({reason})")
-    conf, added = composing.from_file(original.path / "config.json")
-    identity, conf.threads = original.identity(), original.provenance().threads
-    return conf, identity, added
+    return composing.from_file(original.path / "config.json")
 
 
 def _check_plugins_allowed(original: CellFolder, conf: Conf, allowed: Sequence[str]) -> None:
@@ -165,23 +148,16 @@ def _check_plugins_allowed(original: CellFolder, conf: Conf, allowed: Sequence[s
         )
 
 
-def _newer_keys(added: Mapping[str, Any]) -> Iterator[str]:
-    """Yield a line on the keys that are newer than the cell's config."""
+def _differences_before(
+    original: CellFolder, conf: Conf, added: Mapping[str, Any], now: Identity
+) -> Iterator[str]:
+    """Yield differences of the config's keys, the files, the program, libraries and machine."""
     if added:
         values = ", ".join(f"{key}={value}" for key, value in added.items())
         yield f"config.json lacks newer keys; their values in the baseline are taken: {values}"
-
-
-def _damage(original: CellFolder) -> Iterator[str]:
-    """Yield a line on a folder with files that have changed since the cell finished."""
-    state = original.state()
+    state, then = original.state(), original.identity()
     if state.name != "done":
         yield f"the folder: {state.name}: {state.reason}"
-
-
-def _other_program(original: CellFolder, conf: Conf, now: Identity) -> Iterator[str]:
-    """Yield differences of the program, its libraries and the machine."""
-    then = original.identity()
     if then.arithmetic != now.arithmetic:
         change = f"{then.arithmetic} -> {now.arithmetic}"
         yield f"arithmetic, which decides the last digits: {change}"
@@ -189,29 +165,19 @@ def _other_program(original: CellFolder, conf: Conf, now: Identity) -> Iterator[
         if then.code.get(part) != now.code.get(part):
             yield f"code: {part}: {then.code.get(part)} -> {now.code.get(part)}"
     here = provenance.collect(conf.threads or usable_cores(), conf.splat.backend)
-    told = {"started", "arithmetic", "machines_in_turn"}
-    before, after = (
-        _without(msgspec.to_builtins(one), told) for one in (original.provenance(), here)
-    )
-    yield from _changes(before, after)
+    made, made_now = (msgspec.to_builtins(one) for one in (original.provenance(), here))
+    for name in sorted(made_now.keys() - {"started", "arithmetic", "machines_in_turn"}):
+        yield from _changes(made[name], made_now[name], name)
 
 
-def _without(values: Mapping[str, Any], names: set[str]) -> dict[str, Any]:
-    return {name: value for name, value in values.items() if name not in names}
-
-
-def _changes(then: Any, now: Any, path: str = "") -> Iterator[str]:
-    then = {} if then is None and isinstance(now, dict) else then
-    if not isinstance(then, dict) or not isinstance(now, dict):
-        if then != now:
-            yield f"{path}: {_short(then)} -> {_short(now)}"
-        return
-    for name in sorted(then.keys() | now.keys()):
-        yield from _changes(then.get(name), now.get(name), f"{path}.{name}" if path else name)
-
-
-def _short(value: object) -> str:
-    return for_line(str(value), _MAX_VALUE)
+def _changes(then: Any, now: Any, name: str) -> Iterator[str]:
+    """Yield a line for a value that differs; for a dict, one for each entry that does."""
+    if isinstance(now, dict):
+        for key in sorted(then.keys() | now.keys()):
+            yield from _changes(then.get(key), now.get(key), f"{name}.{key}")
+    elif then != now:
+        before, after = (for_line(str(value), _MAX_VALUE) for value in (then, now))
+        yield f"{name}: {before} -> {after}"
 
 
 def _store_of(folder: Path) -> Path:
@@ -230,7 +196,7 @@ def _provide(variant_id: str, conf: Conf, store: Store) -> None:
         XrgsError: It is not, and building it again gives another variant; or its images were
             removed on purpose, and can't be made again.
     """
-    build_variants.restore(conf, store, variant_id)
+    job.restore_images(conf, store, variant_id)
     if (store.variants / variant_id).is_dir():
         return
     log_line(f"variant {variant_id} is not in {store.path} and is built again")
@@ -286,7 +252,7 @@ def _train_again(
     try:
         with SweepMonitor(repeated.path.parent) as monitor:
             monitor.watch([cell])
-            worker.run_in_child("cell", worker.cell_request(variant, repeated))
+            job.run_in_child("cell", job.cell_request(variant, repeated))
     except XrgsError as error:
         repeated.fail(str(error))
         raise XrgsError(f"{error} ({repeated.path / 'log.txt'})") from error
@@ -336,8 +302,8 @@ def _score_differences(original: CellFolder, repeated: CellFolder) -> Iterator[s
         if a != b and not (math.isnan(a) and math.isnan(b)):
             differences_of.setdefault(metric, []).append(abs(a - b))
     for metric, differences in sorted(differences_of.items()):
-        known = [difference for difference in differences if not math.isnan(difference)]
-        amount = f"by at most {max(known):.3g}" if known else "and one of the two has no score"
+        numbers = [difference for difference in differences if not math.isnan(difference)]
+        amount = f"by at most {max(numbers):.3g}" if numbers else "and one of the two has no score"
         yield f"{metric}: differs in {len(differences)} views, {amount}"
 
 

@@ -20,11 +20,11 @@ _MAX_REASON = 1 << 12  # bytes of the file `stopped`
 
 @dataclass(frozen=True)
 class SweepSession:
-    """One call of `xrgs-sweep`, whose jobs know it by its folder."""
+    """One call of `xrgs-sweep`; a job knows the call by this folder."""
 
     folder: Path
     brief: bool = False
-    """Whether the jobs say failures only, as for `xrgs-train`."""
+    """Whether the jobs print only failures, as for `xrgs-train`."""
 
     @property
     def exists(self) -> bool:
@@ -40,18 +40,18 @@ class SweepSession:
         lease.sign(self.folder / "sweep")
 
     def stop(self, reason: str) -> None:
-        """Let no further job begin, for a reason that people can read; the first one is kept."""
+        """Let no further job begin; keep the reason, unless an earlier one is there."""
         # A full disk may have room for the file's name and none for the reason in it.
         with suppress(OSError), (self.folder / "stopped").open("xb") as stream:
             stream.write(reason.encode())
 
     def end(self) -> None:
         """Remove the folder when no job is left, unless a launcher has left its logs in it."""
-        own = {self.folder / "sweep", self.folder / "stopped"}
-        with suppress(OSError):  # it disturbs nobody
-            for of_job in set(self.folder.iterdir()) - own:
-                of_job.rmdir()  # fails where there are logs: then all of the folder stays
-            for file in own:
+        files = {self.folder / "sweep", self.folder / "stopped"}
+        with suppress(OSError):  # a folder that stays disturbs nobody
+            for job_folder in set(self.folder.iterdir()) - files:
+                job_folder.rmdir()  # fails where there are logs: then all of the folder stays
+            for file in files:
                 file.unlink(missing_ok=True)
             self.folder.rmdir()
 

@@ -31,9 +31,11 @@ if TYPE_CHECKING:
 _T = TypeVar("_T")
 #: The most cells, scenes or problems that are listed by name under one heading.
 _MAX_NAMED = 20
-#: Seconds between two looks of `watch`, at least, and the pause in multiples of the time of a look,
-#: so that a slow store is not kept busy; and seconds between two looks that a log gets.
-_WATCH_S, _PAUSE_FACTOR, _LOG_S = 2.0, 20, 60.0
+#: Least seconds between two looks of `watch` on a terminal, and seconds between two in a log.
+_WATCH_S, _LOG_S = 2.0, 60.0
+#: The pause after a look is at least this many times as long as the look took, so that a slow store
+#: is not kept busy.
+_PAUSE_FACTOR = 20
 
 
 @dataclass(frozen=True)
@@ -48,11 +50,11 @@ class StoreStatus:
     variants: tuple[str, ...]
     """Ids of the frozen variants."""
     failed_scenes: tuple[tuple[str, str, str], ...]
-    """Scenes of which no variant could be made: the variant's key, the scene, and the reason."""
+    """Scenes without a variant because SfM failed: the variant's key, the scene, and the reason."""
     sweeps: int
     """Number of recorded sweeps."""
     sizes: Mapping[str, int | None]
-    """Bytes of each subfolder of the store; None where they can't be told."""
+    """Bytes of each subfolder of the store; None where its files can't be listed."""
     problems: tuple[str, ...]
     """A line for each file or folder that can't be read, or that does not belong in a store."""
 
@@ -60,8 +62,8 @@ class StoreStatus:
 def read(path: Path) -> StoreStatus:
     """Read the state of a store, and write nothing.
 
-    Of the cells' files the sizes are compared. Whatever can't be read is named among the problems,
-    and does not hide the rest.
+    The cells' files are checked by their sizes only. A file that can't be read is named among the
+    problems, and does not hide the rest.
 
     Args:
         path: The store's folder.
@@ -71,15 +73,15 @@ def read(path: Path) -> StoreStatus:
     """
     store, problems = Store(path), _Problems()
     store.check_exists()
-    records, damaged = problems.unless(store.records) or ({}, ())
+    records, damaged = problems.note_error(store.records) or ({}, ())
     problems += damaged
-    cells = problems.unless(partial(store.cell_rows, records)) or []
+    cells = problems.note_error(partial(store.cell_rows, records)) or []
     return StoreStatus(
         path=path,
         cells=tuple(cells),
         aside=_aside(store, problems),
-        variants=tuple(problems.unless(lambda: _variants(store, problems)) or []),
-        failed_scenes=tuple(problems.unless(lambda: _failed_scenes(store)) or []),
+        variants=tuple(problems.note_error(lambda: _variants(store, problems)) or []),
+        failed_scenes=tuple(problems.note_error(lambda: _failed_scenes(store)) or []),
         sweeps=len(records) + len(damaged),
         sizes=_sizes(store, problems),
         problems=tuple(problems),
@@ -89,7 +91,7 @@ def read(path: Path) -> StoreStatus:
 class _Problems(list[str]):
     """Lines that name files and folders that can't be read."""
 
-    def unless(self, look: Callable[[], _T]) -> _T | None:
+    def note_error(self, look: Callable[[], _T]) -> _T | None:
         """Return the result of a function; if it can't read a file, add a line and return None."""
         try:
             return look()
@@ -102,7 +104,7 @@ class _Problems(list[str]):
 
 def _aside(store: Store, problems: _Problems) -> int:
     """Count the folders of earlier attempts; add a problem for each name that no cell has."""
-    names = problems.unless(lambda: list_folder(store.cells_folder)) or []
+    names = problems.note_error(lambda: list_folder(store.cells_folder)) or []
     wrong = [name for name in names if not is_name(name)]
     problems += [f"{store.cells_folder}/{name}: a cell can't have this name" for name in wrong]
     return sum("." in name and is_name(name) for name in names)
@@ -123,9 +125,9 @@ def _failed_scenes(store: Store) -> list[tuple[str, str, str]]:
 
 
 def _sizes(store: Store, problems: _Problems) -> dict[str, int | None]:
-    names = problems.unless(lambda: list_folder(store.path)) or []
+    names = problems.note_error(lambda: list_folder(store.path)) or []
     folders = [name for name in names if (store.path / name).is_dir()]
-    return {name: problems.unless(partial(file_bytes, store.path / name)) for name in folders}
+    return {name: problems.note_error(partial(file_bytes, store.path / name)) for name in folders}
 
 
 def describe(status: StoreStatus) -> str:
@@ -157,8 +159,8 @@ def describe(status: StoreStatus) -> str:
 
 def _disk(sizes: Mapping[str, int | None]) -> str:
     texts = [f"{name} {format_size(size)}" for name, size in sorted(sizes.items())]
-    known = format_size(sum(size or 0 for size in sizes.values()))
-    return f"  {known} on disk{' at least' * (None in sizes.values())}: {', '.join(texts)}"
+    total = format_size(sum(size or 0 for size in sizes.values()))
+    return f"  {total} on disk{' at least' * (None in sizes.values())}: {', '.join(texts)}"
 
 
 def _table(cells: Sequence[CellRow]) -> list[str]:
@@ -223,26 +225,26 @@ def watch(path: Path) -> None:
 
 
 def running(store: Store) -> str:
-    """Return the time, how far the sweeps of the cells in training are, and these cells.
+    """Return lines for `watch`: the time, the running sweeps, and the progress of their cells.
 
     Raises:
         StoreError: The store can't be read now.
     """
     records, _ = store.records()
-    now = {}
+    training = {}
     for cell_id in lease.holders(store.leases):
-        if found := progress.read(store.cell(cell_id).progress):
-            now[cell_id] = found
-    lines = [f"{time.strftime('%H:%M:%S')}  {counted(len(now), 'cell')} in training"]
+        if cell_progress := progress.read(store.cell(cell_id).progress):
+            training[cell_id] = cell_progress
+    lines = [f"{time.strftime('%H:%M:%S')}  {counted(len(training), 'cell')} in training"]
     # A cell of several sweeps is trained by the latest one.
     sweeps = {row.cell_id: name for name, record in records.items() for row in record.cells}
-    for name in sorted({sweeps[cell_id] for cell_id in now if cell_id in sweeps}):
+    for name in sorted({sweeps[cell_id] for cell_id in training if cell_id in sweeps}):
         rows = records[name].cells
         ids = {row.cell_id for row in rows if row.cell_id}
         done = sum(store.cell(cell_id).state(verify=False).name == "done" for cell_id in ids)
         lines.append(f"sweep {name}: {done} of {counted(len(rows), 'cell')} done")
     names = latest_records(records)
-    lines += [f"  {_name(cell_id, names.get(cell_id))}: {now[cell_id]}" for cell_id in sorted(now)]
+    lines += [f"  {_name(i, names.get(i))}: {training[i]}" for i in sorted(training)]
     return "\n".join(map(for_line, lines))
 
 

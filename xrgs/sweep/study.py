@@ -5,48 +5,66 @@ expand (axes, matching baselines) -> compose -> variants -> identities -> record
 A cell with `matched_to` takes its number of Gaussians from another cell, and has no identity before
 that cell is done. Cells are therefore launched as they become ready. A cell that another sweep is
 training is left to that sweep; when nothing else is left to do, this sweep waits for it.
+
+Hydra's launcher runs the jobs here or elsewhere, in processes with working folders of their own. A
+job is given the session's folder, the store and the id of its cell. The cell's folder in the store
+holds the config, with full paths, the rasterizer and the job's share of the cores. The outcome of a
+cell is read from the store, so that a launcher that breaks loses its answers and nothing else.
 """
 
 from __future__ import annotations
 
+import copy
 import json
 import re
 import sys
 import time
+from collections import Counter
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
+from hydra.core.plugins import Plugins
 from hydra.errors import CompactHydraException
-from omegaconf import OmegaConf
+from hydra.types import HydraContext
+from omegaconf import OmegaConf, flag_override
 from omegaconf.errors import OmegaConfBaseException
 
-from xrgs.composing import to_conf
+from xrgs.composing import escape_interpolations, to_conf
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.evaluation.lpips import weights
-from xrgs.mixture.split import check_variant_conf
 from xrgs.photos import scenes
 from xrgs.runtime import lease
-from xrgs.runtime.machine import usable_cores
+from xrgs.runtime.machine import gpus, usable_cores
 from xrgs.runtime.progress import log_line
 from xrgs.runtime.streams import say
 from xrgs.safeio.files import is_transient
-from xrgs.safeio.hashing import digest, to_plain
-from xrgs.safeio.sanitize import for_line
-from xrgs.splat.settings import SSIM_WINDOW
+from xrgs.safeio.paths import user_path
+from xrgs.safeio.sanitize import counted, for_line
+from xrgs.splat.backend import resolve_backend
+from xrgs.store.attempts import plan_cell
 from xrgs.store.store import Store, StoreGoneError
-from xrgs.sweep import build_variants, controls, launch, track
+from xrgs.sweep import controls, launchers, track
 from xrgs.sweep.axes import CellSpec, effective, expand
 from xrgs.sweep.ending import ending
 from xrgs.sweep.estimate import CostEstimator
-from xrgs.sweep.jobs import worker
-from xrgs.sweep.jobs.job import FAIL_FAST, LOCKED, UNWRITABLE
+from xrgs.sweep.job import (
+    FAIL_FAST,
+    INTERRUPTED,
+    LOCKED,
+    NOTHING_LOST,
+    STOPPED,
+    UNWRITABLE,
+    unwritable,
+)
 from xrgs.sweep.monitor import SweepMonitor
 from xrgs.sweep.plan import (
     PlannedCell,
+    check_sizes,
     describe,
     estimated,
+    expected_length,
     expected_use,
     identified,
     left_to_train,
@@ -55,21 +73,29 @@ from xrgs.sweep.plan import (
     record,
     unchanged,
     will_fail,
+    with_variants,
     with_wanted_baselines,
     without_kernels,
 )
+from xrgs.sweep.session import SweepSession
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
-    from hydra.types import HydraContext, TaskFunction
+    from hydra.core.config_loader import ConfigLoader
+    from hydra.core.utils import JobReturn
+    from hydra.types import TaskFunction
     from omegaconf import DictConfig
 
     from xrgs.config import Conf
 
 #: An override that sets a key to a number.
 _NUMBER = re.compile(r"([\w.]+)=((?:0|[1-9]\d*)(?:\.\d+)?)")
-#: Seconds between two looks at the cells of other sweeps.
+#: Outcome of a job without an answer; the cell may be launched again.
+LOST = "lost"
+#: After this many jobs that began it and gave no answer, a cell is not launched again.
+_MAX_LOSSES = 3
+#: Seconds between two looks at the cells of other sweeps, or at the jobs of a broken launcher.
 _POLL_S = 2.0
 
 
@@ -99,7 +125,7 @@ class Study:
         self._composed: dict[tuple[str, ...], DictConfig] = {}
         self._confs: dict[tuple[str, ...], Conf] = {}
         self._store: Store | None = None
-        """The store, once it is prepared."""
+        """None until the store is prepared."""
 
     def run(self, arguments: Sequence[str]) -> None:
         """Plan the cells, build their variants, train unfinished cells, record and report.
@@ -108,7 +134,7 @@ class Study:
             arguments: Hydra overrides, with the axes among them.
 
         Raises:
-            CompactHydraException: The user can correct the problem; Hydra prints the message alone.
+            CompactHydraException: The user can correct the problem; Hydra prints only the message.
             SystemExit: With code 1 if a cell failed; the table is printed first.
         """
         try:
@@ -127,8 +153,8 @@ class Study:
             return str(gone)
         if not isinstance(error, OSError):
             return str(error)
-        if worker.unwritable(error):
-            return f"store={self._config.store}: {error}. {worker.NOTHING_LOST}"
+        if unwritable(error):
+            return f"store={self._config.store}: {error}. {NOTHING_LOST}"
         if is_transient(error):
             return f"store={self._config.store}: {error}; run the same command again"
         raise error
@@ -140,7 +166,7 @@ class Study:
             StoreError: The store can't be written, or is no longer there.
             XrgsError: A value of a cell's config is out of its range.
         """
-        launch.check(self._config)
+        launchers.check(self._config)
         arguments = effective(arguments)
         plan = self._plan(arguments)
         track.check(plan[0].conf.track)
@@ -151,7 +177,9 @@ class Study:
         else:
             store.prepare()
             self._store = store
-        plan = self._with_variants(plan, store, allow_build=not dry_run)
+        plan, notes = with_variants(plan, store, allow_build=not dry_run)
+        for line in () if self._brief else notes:
+            log_line(line)
         plan = self._identified(plan, store)
         past = CostEstimator(store)
         plan = estimated(plan, past, self._threads(len(plan)))
@@ -190,7 +218,7 @@ class Study:
     def _threads(self, cells: int) -> int:
         """Return the threads of a cell whose config sets no number of threads."""
         launcher, machine = self._config.hydra.launcher, usable_cores()
-        return launch.capacity(launcher, 0, machine).threads(cells, machine) or machine
+        return launchers.capacity(launcher, 0, machine).threads(cells, machine) or machine
 
     def _run_until_complete(
         self,
@@ -205,7 +233,7 @@ class Study:
         """
         conf = plan[0].conf
         waiting_said, tried = False, set[str]()
-        launches = launch.Launches(self._context, self._task, self._config)
+        launches = Launches(self._context, self._task, self._config)
         while True:
             store.check_not_gone()
             for watcher in watchers:
@@ -216,13 +244,13 @@ class Study:
                 launches.end()
                 return list(plan)
             outcomes = launches.launch(to_train.values(), store) if to_train else {}
-            not_begun = {LOCKED, launch.LOST}
+            not_begun = {LOCKED, LOST}
             begun = {cell_id for cell_id in to_train if outcomes[cell_id] not in not_begun}
             tried |= begun
             store.check_not_gone()
             plan = self._identified(plan, store)
             if UNWRITABLE in outcomes.values():
-                raise StoreError(f"store={store.path} can't be written. {worker.NOTHING_LOST}")
+                raise StoreError(f"store={store.path} can't be written. {NOTHING_LOST}")
             failed = conf.fail_fast and "failed" in outcomes.values()
             if reason := launches.stopped or (FAIL_FAST if failed else ""):
                 log_line(f"no further cell is started: {reason}")
@@ -257,17 +285,17 @@ class Study:
 
     def _with_effective_match(self, spec: CellSpec) -> CellSpec:
         """Drop `matched_to` unless the ablation is count-matched."""
-        alone = spec.without_match
-        if alone == spec or self._compose(alone).matched_to is not None:
+        unmatched = spec.without_match
+        if unmatched == spec or self._compose(unmatched).matched_to is not None:
             return spec
-        return alone
+        return unmatched
 
     def _identified(self, plan: Sequence[PlannedCell], store: Store) -> list[PlannedCell]:
         """Return the cells with their counts, identities and states, as far as known."""
         cells: dict[CellSpec, PlannedCell] = {}
         holders = lease.holders(store.leases)
-        for known in plan:
-            cell = identified(self._with_count(known, cells, store), store, holders)
+        for earlier in plan:
+            cell = identified(self._with_count(earlier, cells, store), store, holders)
             cells[cell.spec] = cell
         return list(cells.values())
 
@@ -287,7 +315,7 @@ class Study:
         return replace(cell, spec=spec, conf=self._compose(spec))
 
     def _compose(self, spec: CellSpec) -> Conf:
-        """Return a cell's config; it is composed once, and asked for by other cells as well."""
+        """Return a cell's config, composed once however often it is asked for."""
         overrides = tuple(spec.overrides)
         if overrides not in self._confs:
             conf = to_conf(self._hydra_config(overrides))
@@ -296,55 +324,249 @@ class Study:
         return self._confs[overrides]
 
     def _hydra_config(self, overrides: tuple[str, ...]) -> DictConfig:
-        """Return Hydra's config; those that differ in numbers alone share one composition.
+        """Return Hydra's config. Configs that differ only in numbers share one composition.
 
         Composing takes 0.1 s.
         """
         numbers = {text: match for text in overrides if (match := _NUMBER.fullmatch(text))}
-        alike = tuple(numbers[text][1] if text in numbers else text for text in overrides)
-        if alike not in self._composed:
+        shared = tuple(numbers[text][1] if text in numbers else text for text in overrides)
+        if shared not in self._composed:
             loader = self._context.config_loader
-            self._composed[alike] = loader.load_sweep_config(self._config, [*overrides])
-        composed = self._composed[alike]
+            self._composed[shared] = loader.load_sweep_config(self._config, [*overrides])
+        composed = self._composed[shared]
         for match in numbers.values():
             OmegaConf.update(composed, match[1], json.loads(match[2]))  # ${seed} follows seed
-        launch.check(self._config, composed)
+        launchers.check(self._config, composed)
         return composed
 
-    def _with_variants(
-        self, plan: Sequence[PlannedCell], store: Store, *, allow_build: bool
-    ) -> list[PlannedCell]:
-        """Return the cells with their variants, or with the reasons why there are none."""
-        keys = [digest([to_plain(cell.conf.scene), to_plain(cell.conf.variant)]) for cell in plan]
-        confs = {key: cell.conf for key, cell in zip(keys, plan, strict=True)}
-        made = build_variants.plan([*confs.values()], store, allow_build=allow_build)
-        results = dict(zip(confs, made, strict=True))
-        said: dict[str, None] = {}
-        cells = []
-        for key, cell in zip(keys, plan, strict=True):
-            found = results[key]
-            cells.append(
-                replace(cell, variant_id=found.id, error=found.error, remembered=found.remembered)
+
+class Launches:
+    """The launches of one call of `xrgs-sweep`."""
+
+    def __init__(self, context: HydraContext, task: TaskFunction, config: DictConfig) -> None:
+        """Prepare to launch, as `Study`; nothing is written before the first launch."""
+        self._name = str(config.hydra.runtime.choices["hydra/launcher"])
+        loader = cast("ConfigLoader", _JobConfigLoader())  # launchers call no other method
+        self._context = HydraContext(loader, context.callbacks)
+        self._task = task
+        self._config = copy.deepcopy(config)
+        self._session: SweepSession | None = None
+        self._jobs = 0
+        self._losses: Counter[str] = Counter()
+        self._suspects: set[str] = set()
+
+    def _begin(self, store: Store) -> SweepSession:
+        """Create the session's folder, and give its full path to every job."""
+        folder = _create_unique(user_path(self._config.hydra.sweep.dir).absolute(), store)
+        self._set("sweep.dir", escape_interpolations(str(folder)))
+        session = SweepSession(folder)
+        session.begin()
+        return session
+
+    def end(self) -> None:
+        """Tidy up after the last launch, whose jobs have all ended."""
+        if self._session is not None:
+            self._session.end()
+
+    def _set(self, key: str, value: Any) -> None:
+        with flag_override(self._config.hydra, ["readonly", "struct"], False):
+            OmegaConf.update(self._config.hydra, key, value)
+
+    @property
+    def stopped(self) -> str:
+        """Why no further job may begin; empty while they may."""
+        return self._session.stopped if self._session else ""
+
+    def launch(self, cells: Iterable[PlannedCell], store: Store) -> dict[str, str]:
+        """Launch cells that have an identity, the longest first, and wait for them.
+
+        Returns:
+            The outcome of each cell's job by the cell's id: what `run_job` returned, `LOST` if the
+            cell may be launched again, or the cell's state after its last loss.
+
+        Raises:
+            XrgsError: The launcher can't be used, or begins no job; or the store is gone.
+        """
+        self._session = session = self._session or self._begin(store)
+        cells = sorted(cells, key=expected_length, reverse=True)
+        threads, machine = max(cell.conf.threads for cell in cells), usable_cores()
+        launcher = self._config.hydra.launcher
+        allowed = launchers.capacity(launcher, threads, machine)
+        if any(cell.conf.splat.backend == "gsplat" for cell in cells):
+            allowed = launchers.one_cell_a_gpu(launcher, allowed, len(gpus()))
+        for key, value in allowed.settings.items():
+            self._set(f"launcher.{key}", value)
+        outcomes: dict[str, str] = {}
+        for batch in self._batches(cells, allowed.batch or len(cells)):
+            if session.stopped:
+                outcomes |= {str(cell.cell_id): STOPPED for cell in batch}
+                continue
+            outcomes |= self._launch_batch(batch, allowed.threads(len(batch), machine), store)
+        return outcomes
+
+    def _batches(self, cells: Sequence[PlannedCell], size: int) -> list[Sequence[PlannedCell]]:
+        """Divide cells into batches. Cells that may have broken a launcher come last, one each."""
+        others = [cell for cell in cells if cell.cell_id not in self._suspects]
+        suspects = [cell for cell in cells if cell.cell_id in self._suspects]
+        return [
+            *(others[start : start + size] for start in range(0, len(others), size)),
+            *([cell] for cell in suspects),
+        ]
+
+    def _launch_batch(
+        self, cells: Sequence[PlannedCell], threads: int, store: Store
+    ) -> dict[str, str]:
+        if self._name != "basic":
+            number = counted(len(cells), "cell")
+            log_line(f"hydra/launcher={self._name}: {number}, threads={threads} each")
+        overrides = [_hand_over(cell, threads, store) for cell in cells]
+        first, self._jobs = self._jobs, self._jobs + len(cells)
+        try:
+            if "submitit" in str(self._config.hydra.launcher["_target_"]):
+                from xrgs.sweep import submitit_jobs  # submitit is an extra
+
+                submitit_jobs.follow()
+            launcher = Plugins.instance().instantiate_launcher(
+                hydra_context=self._context, task_function=self._task, config=self._config
             )
-            said |= dict.fromkeys(f"{scenes.label(cell.conf.scene)}: {n}" for n in found.notes)
-        for line in () if self._brief else said:
-            log_line(line)
-        return cells
+            returned = launcher.launch(overrides, first)
+        except Exception as error:
+            store.check_not_gone()
+            return self._after_loss(cells, error, store)
+        return {
+            str(cell.cell_id): self._outcome(cell, job, store)
+            for cell, job in zip(cells, returned, strict=True)
+        }
+
+    def _outcome(self, cell: PlannedCell, job: JobReturn, store: Store) -> str:
+        """Return what `run_job` returned. An exception in a job concerns only its own cell."""
+        try:
+            answer = str(job.return_value)
+        except Exception as error:  # submitit raises for a job that was out of time too often
+            log_line(f"{cell.name}: {_first_line(error)}")
+        else:
+            if answer == INTERRUPTED:
+                log_line(f"{cell.name}: its job was asked to end; the next sweep continues it")
+            return answer
+        state = store.cell(str(cell.cell_id)).state().name
+        if state == "unfinished":
+            return self._after_silence(str(cell.cell_id), state)
+        return "done" if state == "done" else "failed"
+
+    def _after_silence(self, cell_id: str, state: str) -> str:
+        """Return the outcome of a job without an answer, from the state of its cell."""
+        self._losses[cell_id] += state == "unfinished"
+        ended = state in {"done", "failed"} or self._losses[cell_id] >= _MAX_LOSSES
+        return state if ended else LOST
+
+    def _after_loss(
+        self, cells: Sequence[PlannedCell], error: Exception, store: Store
+    ) -> dict[str, str]:
+        """Return the outcome of each cell after the launcher raised."""
+        reason = f"hydra/launcher={self._name}: {_first_line(error)}"
+        before = {str(cell.cell_id): cell.state.name for cell in cells}
+        while before.keys() & lease.holders(store.leases).keys():
+            time.sleep(_POLL_S)  # jobs that outlive their launcher still use their cores
+        states = {cell_id: store.cell(cell_id).state().name for cell_id in before}
+        unchanged = {
+            cell_id: state != "unfinished" and state in {before[cell_id], "planned"}
+            for cell_id, state in states.items()
+        }
+        if all(unchanged.values()):
+            raise XrgsError(f"{reason}. The launcher began no cell.") from error
+        self._suspects |= {cell_id for cell_id in states if states[cell_id] == "unfinished"}
+        outcomes = {cell: self._after_silence(cell, state) for cell, state in states.items()}
+        log_line(reason)
+        log_line(f"of its {len(cells)} cells these are not finished:")
+        for cell in cells:
+            outcome, state = outcomes[str(cell.cell_id)], states[str(cell.cell_id)]
+            if state not in {"done", "failed"}:
+                note = state if outcome == LOST else f"lost {_MAX_LOSSES} times, not tried again"
+                log_line(f"  {cell.cell_id}  {cell.name}  ({note})")
+        return outcomes
 
 
-def check_sizes(conf: Conf) -> None:
-    """Refuse a config with images too small for SSIM, or with invalid values of its variant.
+class _JobConfigLoader:
+    """Gives each job Hydra's own settings and the id of its cell, and composes no config.
 
-    Raises:
-        XrgsError: A value is out of its range; the message names the key.
+    Launchers ask the config loader for a job's config, on the machine that runs the job. Hydra's
+    loader would compose the cell's config a second time.
     """
-    check_variant_conf(conf.variant)
-    side, least = conf.variant.long_side, conf.variant.factor * SSIM_WINDOW
-    if 0 < side < least:
-        raise XrgsError(
-            f"variant.long_side={side}: must be 0 (the photographs' size) or at least {least}, so"
-            f" that LR views have the {SSIM_WINDOW} px a side that SSIM needs"
-        )
+
+    def load_sweep_config(self, master_config: DictConfig, overrides: list[str]) -> DictConfig:
+        """Return the sweep's `hydra` node with `cell` (its id), `store` and `name` of one job.
+
+        Raises:
+            XrgsError: The session's folder is no longer there. Hydra would make it again.
+        """
+        folder = master_config.hydra.sweep.dir
+        if not SweepSession(Path(folder)).exists:
+            raise XrgsError(f"hydra.sweep.dir={folder} is no longer there")
+        config = OmegaConf.masked_copy(master_config, ["hydra"])
+        with flag_override(config, ["readonly", "struct"], False):
+            for override in overrides:
+                # As text: an id of digits only, or like 12e4567..., would be parsed as a number.
+                key, _, value = override.partition("=")
+                config[key] = escape_interpolations(value)
+        with flag_override(config.hydra, ["readonly", "struct"], False):
+            config.hydra.overrides.task = overrides[:1]
+            config.hydra.job.override_dirname = overrides[0]
+        OmegaConf.set_readonly(config.hydra, False)
+        return config
+
+
+def _first_line(error: Exception) -> str:
+    return for_line(f"{type(error).__name__}: {str(error).strip().partition(chr(10))[0]}")
+
+
+def _create_unique(preferred: Path, store: Store) -> Path:
+    """Create a folder, with a number appended to its name if another call has the name already."""
+    home = store.path.absolute()
+    try:
+        # The store itself is not made again: it may have been moved since the plan.
+        above = preferred.parent
+        if not above.is_relative_to(home) or home.is_dir():
+            above.mkdir(parents=True, exist_ok=True)
+        folder, number = preferred, 1
+        while True:
+            try:
+                folder.mkdir()
+            except FileExistsError:
+                number += 1
+                folder = preferred.with_name(f"{preferred.name}-{number}")
+            else:
+                return folder
+    except OSError as error:
+        if unwritable(error):
+            raise
+        raise XrgsError(f"hydra.sweep.dir={preferred}: {error}") from error
+
+
+def _hand_over(cell: PlannedCell, threads: int, store: Store) -> list[str]:
+    """Write a cell's config for a job on any machine; return the overrides of the job."""
+    if cell.identity is None or cell.cell_id is None:
+        raise ValueError(f"{cell.name}: launched without an identity")
+    home, scene = store.path.absolute(), cell.conf.scene
+    path, masks = (
+        str(user_path(text).absolute()) if text else text for text in (scene.path, scene.masks)
+    )
+    conf = replace(
+        cell.conf,
+        store=str(home),
+        splat=replace(cell.conf.splat, backend=resolve_backend(cell.conf.splat.backend)),
+        threads=cell.conf.threads or threads,
+        scene=replace(scene, path=path, masks=masks),
+    )
+    # Under the lease: since the plan, another sweep may have begun or finished the cell.
+    cell_lease = lease.acquire(store.leases, cell.cell_id)
+    if cell_lease is not None:
+        try:
+            state = store.cell(cell.cell_id).state(verify=False)
+            if state.name != "done" and not state.unreadable:
+                plan_cell(store.cell(cell.cell_id), conf, cell.identity)
+        finally:
+            cell_lease.release()
+    return [f"cell={cell.cell_id}", f"store={home}", f"name={cell.name}"]
 
 
 def provide_lpips(*, fetch: bool, dry_run: bool) -> None:
@@ -379,16 +601,16 @@ def provide_lpips(*, fetch: bool, dry_run: bool) -> None:
 
 def _tidy(done: set[str], store: Store) -> None:
     """Remove checkpoints and leases of done cells, which a killed sweep has left."""
-    with suppress(OSError):  # they disturb nobody, and the next sweep removes them
+    with suppress(OSError):  # left-over files disturb nobody, and the next sweep removes them
         for cell_id in done:
             store.cell(cell_id).drop_checkpoint()
         for cell_id in done & lease.names(store.leases):
-            if (held := lease.acquire(store.leases, cell_id)) is not None:
-                held.release()
+            if (cell_lease := lease.acquire(store.leases, cell_id)) is not None:
+                cell_lease.release()
 
 
 def _without_reference(cell: PlannedCell) -> PlannedCell:
-    """Return a cell that waits for a count in vain with an error that says so."""
+    """Return a cell, with an error if it still waits for the count of its reference."""
     if cell.error is not None or not cell.waits:
         return cell
     return replace(cell, error=f"matched_to={cell.conf.matched_to}: that cell is not done")

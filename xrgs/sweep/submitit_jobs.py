@@ -14,8 +14,7 @@ from hydra.core.utils import JobReturn, JobStatus
 from submitit.core.core import Job
 from submitit.slurm.slurm import SlurmInfoWatcher, SlurmJob
 
-from xrgs.errors import XrgsError
-from xrgs.sweep.jobs.job import INTERRUPTED
+from xrgs.sweep.job import INTERRUPTED, WorkError
 
 #: Seconds between two looks at SLURM's queue, which remembers ended jobs for five minutes.
 _LOOK_S = 30
@@ -26,10 +25,6 @@ _ENDED = frozenset(
     {"BOOT_FAIL", "CANCELLED", "COMPLETED", "DEADLINE", "FAILED", "NODE_FAIL", "OUT_OF_MEMORY"}
     | {"PREEMPTED", "REVOKED", "TIMEOUT", _NOT_LISTED}
 )
-
-
-class JobLostError(XrgsError):
-    """A job ended without an answer."""
 
 
 class QueueWatcher(SlurmInfoWatcher):
@@ -68,5 +63,5 @@ def _results(job: Job[Any], wait: Any = Job.results) -> list[JobReturn]:
     except Exception:
         if job.state == "CANCELLED":
             return [JobReturn(status=JobStatus.COMPLETED, _return_value=INTERRUPTED)]
-        known = f"job {job.job_id} ({job.state}) gave no answer; its log is {job.paths.stderr}"
-        return [JobReturn([job.job_id], status=JobStatus.FAILED, _return_value=JobLostError(known))]
+        reason = f"job {job.job_id} ({job.state}) gave no answer; its log is {job.paths.stderr}"
+        return [JobReturn([job.job_id], status=JobStatus.FAILED, _return_value=WorkError(reason))]

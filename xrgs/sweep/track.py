@@ -53,12 +53,12 @@ def check(kind: str) -> None:
 
 
 def curves(cell: CellFolder, *, done: bool) -> Curves:
-    """Read what a cell has written so far.
+    """Read the curves that a cell has written so far.
 
     Args:
         cell: The cell, which has written its first row.
         done: Whether the cell is done. Otherwise the curves end with the last row of the history:
-            what was evaluated after that row may not be complete.
+            scores of later steps may not be complete.
 
     Raises:
         StoreError: A file can't be read; the message names it.
@@ -66,15 +66,15 @@ def curves(cell: CellFolder, *, done: bool) -> Curves:
     """
     history = _table(cell.path / "history.csv", "history")
     quality = cell.path / "quality.csv"
-    found = [*history, *(_table(quality, "quality") if quality.is_file() else ())]
+    rows = [*history, *(_table(quality, "quality") if quality.is_file() else ())]
     if done:
-        found.append(_scores(cell))
+        rows.append(_scores(cell))
     else:
-        found = [(step, values) for step, values in found if step <= history[-1][0]]
+        rows = [(step, values) for step, values in rows if step <= history[-1][0]]
     by_step: Curves = {}
-    for step, values in sorted(found, key=lambda row: row[0]):
-        known = {name: value for name, value in values.items() if not math.isnan(value)}
-        by_step.setdefault(step, {}).update(known)
+    for step, values in sorted(rows, key=lambda row: row[0]):
+        numbers = {name: value for name, value in values.items() if not math.isnan(value)}
+        by_step.setdefault(step, {}).update(numbers)
     return by_step
 
 
@@ -119,30 +119,30 @@ def run_of(planned: PlannedCell, cell: CellFolder) -> Run:
 
 
 class _Followed:
-    """One cell, and what of it was sent."""
+    """A cell whose curves are sent to a tracker, and which of its files were sent."""
 
     def __init__(self, planned: PlannedCell, cell: CellFolder) -> None:
         self.cell = cell
         self._planned = planned
         self._sink: Sink | None = None
         self._seen: tuple[float, ...] = ()
-        """When the files were written that were read last."""
+        """The times of the files that were sent last."""
         self.ended = False
         """Whether nothing more is to be sent: the cell is done, or can't be read."""
 
     def send(self, kind: str, folder: Path) -> None:
-        """Send what is new.
+        """Send the steps that the tracker lacks.
 
         Raises:
-            Exception: Whatever a package, a server or a disk raises. The next call goes on from
-                what has arrived.
+            Exception: Whatever a package, a server or a disk raises. The next call asks the
+                tracker for its last step, and goes on from there.
         """
         written = () if self.ended else tuple(self._written())
         if not written or written == self._seen:
             return
         state = self.cell.state(verify=False).name
         try:
-            found = curves(self.cell, done=state == "done")
+            by_step = curves(self.cell, done=state == "done")
         except (StoreError, ValueError) as error:
             # Read again, if a new attempt is replacing the file or it can't be read now.
             self.ended = state == "done" and not isinstance(error, UnreadableError)
@@ -150,11 +150,11 @@ class _Followed:
                 log_line(f"{self.cell.id}: it is not tracked: {error}")
             return
         try:
-            self._send(found, kind, folder)
+            self._send(by_step, kind, folder)
             if state in {"done", "failed"}:
                 self.close(state)
         except BaseException:
-            self._sink = None  # the next one asks what has arrived
+            self._sink = None  # the next one reads its last step anew
             raise
         self._seen, self.ended = written, state == "done"
 
@@ -163,10 +163,10 @@ class _Followed:
             with suppress(OSError):
                 yield (self.cell.path / name).stat().st_mtime_ns
 
-    def _send(self, found: Curves, kind: str, folder: Path) -> None:
+    def _send(self, by_step: Curves, kind: str, folder: Path) -> None:
         if self._sink is None:
             self._sink = SINKS[kind](run_of(self._planned, self.cell), folder)
-        new = {step: found[step] for step in found if step > self._sink.sent}
+        new = {step: by_step[step] for step in by_step if step > self._sink.sent}
         if new:
             self._sink.send(new)
             self._sink.sent = max(new)
@@ -189,7 +189,7 @@ class Tracker:
         self._cells: dict[str, _Followed] = {}
         self._elsewhere: set[str | None] = set()
         """Cells that another sweep trains, and follows."""
-        self._failed = self._said = False
+        self._failed = self._has_said_so = False
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._follow, name="xrgs-track", daemon=True)
 
@@ -228,7 +228,7 @@ class Tracker:
             )
 
     def _hint(self) -> str:
-        """Return where to look."""
+        """Return where people find the curves: a command, an address or a folder."""
         if self._kind == "tensorboard":
             return f"tensorboard --logdir {self._folder}"
         if self._kind == "mlflow":
@@ -245,7 +245,7 @@ class Tracker:
         self.close()
 
     def look(self) -> None:
-        """Send what is new of each cell; say once if that fails."""
+        """Send the new steps of each cell; print a message the first time that this fails."""
         self._failed = False
         for cell in self._cells.values():
             try:
@@ -253,15 +253,15 @@ class Tracker:
                 cell.send(self._kind, self._folder)
             except Exception as error:  # of a package, a server or a disk
                 self._failed = True
-                if not self._said:
+                if not self._has_said_so:
                     log_line(
                         f"track={self._kind}: {type(error).__name__}: {error}; the cells train on,"
                         f" and it is tried again every {_PAUSE_S:.0f} s"
                     )
-                self._said = True
+                self._has_said_so = True
 
     def close(self) -> None:
         """End the runs that are still open: their cells were stopped."""
         for cell in self._cells.values():
-            with suppress(Exception):  # what was sent is there
+            with suppress(Exception):  # the steps that were sent are there
                 cell.close("stopped")

@@ -1,8 +1,8 @@
 """Where people follow trainings: TensorBoard, Weights & Biases, MLflow, or tables.
 
-A sink takes the curves of one cell, step by step. Its `sent` is the last step that it has, which it
-reads from where the curves go. So a cell that resumes, in this sweep or a later one, continues its
-run, and no step is there twice.
+A sink takes the curves of one cell, step by step. Its `sent` is the last step that has arrived; a
+new sink reads it back from the tracker. So a cell that resumes, in this sweep or a later one,
+continues its run, and no step is there twice.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 #: The values of each step by the names of their series: `history/<column>`, `quality/<score>`
-#: (during training) and `score/<metric>` (of the end).
+#: (during training) and `score/<metric>` (at the end).
 Curves = dict[int, dict[str, float]]
 #: The names of a cell in the record of a sweep.
 NAMES = ("scene", "label", "condition", "variant_seed", "seed")
@@ -34,7 +34,7 @@ NAMES = ("scene", "label", "condition", "variant_seed", "seed")
 _MAX_PARAMS = 100
 #: The project of Weights & Biases and the experiment of MLflow.
 _PROJECT = "xrgs"
-#: Seconds after which the process of Weights & Biases writes what it was given.
+#: Seconds after which the process of Weights & Biases writes values to disk.
 _WANDB_S = 0.2
 #: The variable that names MLflow's server.
 _SERVER = "MLFLOW_TRACKING_URI"
@@ -60,13 +60,13 @@ class Run:
 
 
 class Sink:
-    """Takes the curves of one cell. Every method raises what its package, server or disk does."""
+    """Takes the curves of one cell. Any method may raise an error of a package, server or disk."""
 
     sent = -1
     """The last step that is there; -1 where none is."""
 
     def send(self, new: Curves) -> None:
-        """Add steps that are all later than `sent`, so that people who look now see them."""
+        """Add steps, all later than `sent`; people see them at once."""
         raise NotImplementedError
 
     def close(self, state: str) -> None:
@@ -110,7 +110,7 @@ class _Events(Sink):
         home.mkdir(exist_ok=True)
         files = sorted(home.iterdir())
         events = (event for file in files for event in EventFileLoader(str(file)).Load())
-        # The tags of what the page HParams shows begin with "_".
+        # Tags that begin with "_" are those of the page HParams.
         steps = (e.step for e in events for value in e.summary.value if value.tag[:1] != "_")
         self.sent = max(steps, default=-1)
         # TensorBoard reads the files of a folder in the order of their names.
@@ -121,7 +121,7 @@ class _Events(Sink):
             self._add_config(run)
 
     def _add_config(self, run: Run) -> None:
-        """Add what the page HParams shows."""
+        """Add the config and the names of the metrics, for the page HParams."""
         from tensorboard.plugins.hparams import summary_v2
 
         config = {**run.config, **run.names}
@@ -155,8 +155,8 @@ class _MLflow(Sink):
         from mlflow import MlflowClient
 
         self._client = client = MlflowClient(mlflow_uri(folder))
-        found = client.get_experiment_by_name(_PROJECT)
-        experiment = found.experiment_id if found else client.create_experiment(_PROJECT)
+        stored = client.get_experiment_by_name(_PROJECT)
+        experiment = stored.experiment_id if stored else client.create_experiment(_PROJECT)
         runs = client.search_runs([experiment], f"tags.cell_id = '{run.cell_id}'", max_results=1)
         if not runs:
             self._id, self._ended, self.sent = self._create(experiment, run), False, -1
@@ -200,7 +200,7 @@ class _MLflow(Sink):
 class _Wandb(Sink):
     """A run of Weights & Biases, whose id is the cell's.
 
-    Its files can't be read back by its own package, so a file beside them keeps the last step.
+    The package can't read its own files back, so a file beside them keeps the last step.
     """
 
     def __init__(self, run: Run, folder: Path) -> None:
@@ -240,7 +240,7 @@ class _Wandb(Sink):
         self._opened = self._opened or self._open()
         for step, values in new.items():
             self._opened.log(values, step=step, commit=True)
-        # A kill loses what W&B's own process has not written yet. It says nothing when it has.
+        # A kill loses values that W&B's own process has not written yet, and it reports no write.
         time.sleep(2 * _WANDB_S)
         write_json(self._mark, max(new), durable=False)
 
@@ -254,10 +254,10 @@ def mlflow_uri(folder: Path) -> str:
     return os.environ.get(_SERVER) or f"sqlite:///{(folder / 'mlflow.db').absolute()}"
 
 
+#: The sinks by the values of `track`. Each gets a cell and the folder of its kind in the store.
 SINKS: dict[str, Callable[[Run, Path], Sink]] = {
     "csv": _Table,
     "tensorboard": _Events,
     "mlflow": _MLflow,
     "wandb": _Wandb,
 }
-"""The sinks by the values of `track`. Each gets a cell and the folder of its kind in the store."""

@@ -22,7 +22,7 @@ from xrgs.store.attempts import begin_attempt, plan_cell
 from xrgs.store.cell_folder import CellFolder
 from xrgs.store.identity import cell_identity
 from xrgs.store.store import Store
-from xrgs.sweep.jobs import worker
+from xrgs.sweep import job
 
 pytestmark = pytest.mark.slow
 
@@ -40,8 +40,8 @@ def stopping(path, target):
     return replace(path, target)
 
 Path.replace = stopping
-from xrgs.sweep.jobs import worker
-worker.main("cell", request, answer)
+from xrgs.sweep import job
+job.main("cell", request, answer)
 """
 
 
@@ -82,7 +82,7 @@ def files(folder: Path) -> dict[str, tuple[int, bytes]]:
 def test_a_worker_that_wakes_up_after_a_takeover_writes_into_its_own_folder_alone(
     cell: CellFolder, built: Variant, tmp_path: Path, file: str, done: bool
 ) -> None:
-    write_json(tmp_path / "request", worker.cell_request(built.folder, cell))
+    write_json(tmp_path / "request", job.cell_request(built.folder, cell))
     arguments = [file, str(tmp_path / "request"), str(tmp_path / "answer")]
     child = subprocess.Popen([sys.executable, "-P", "-c", STOPPED, *arguments])
     assert os.WIFSTOPPED(os.waitpid(child.pid, os.WUNTRACED)[1])
@@ -105,7 +105,7 @@ def test_a_worker_that_wakes_up_after_a_takeover_writes_into_its_own_folder_alon
 def test_a_worker_whose_folder_was_removed_ends_and_creates_nothing(
     cell: CellFolder, built: Variant, tmp_path: Path
 ) -> None:
-    write_json(tmp_path / "request", worker.cell_request(built.folder, cell))
+    write_json(tmp_path / "request", job.cell_request(built.folder, cell))
     arguments = ["checkpoint.npz", str(tmp_path / "request"), str(tmp_path / "answer")]
     child = subprocess.Popen([sys.executable, "-P", "-c", STOPPED, *arguments])
     assert os.WIFSTOPPED(os.waitpid(child.pid, os.WUNTRACED)[1])
@@ -123,12 +123,12 @@ def test_a_worker_that_starts_after_a_takeover_does_nothing(
     cell: CellFolder, built: Variant, gone: bool
 ) -> None:
     """Its parent was suspended between the beginning of the cell and the start of this worker."""
-    request = worker.cell_request(built.folder, cell)
+    request = job.cell_request(built.folder, cell)
     begin_attempt(cell)
     if gone:
         shutil.rmtree(cell.path)
     before = files(cell.path)
-    with pytest.raises(worker.AttemptLostError, match="another attempt at the cell has begun"):
-        worker.run_in_child("cell", request)
+    with pytest.raises(job.WorkError, match="another attempt at the cell has begun"):
+        job.run_in_child("cell", request)
     assert files(cell.path) == before
     assert cell.path.exists() != gone

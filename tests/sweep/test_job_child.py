@@ -16,15 +16,8 @@ import pytest
 
 from xrgs.errors import XrgsError
 from xrgs.runtime import processes
-from xrgs.sweep.jobs import supervise, worker
-from xrgs.sweep.jobs.supervise import ProcessEnd
-from xrgs.sweep.jobs.worker import (
-    AttemptLostError,
-    InterruptedWorkError,
-    UnwritableError,
-    WorkerError,
-    run_in_child,
-)
+from xrgs.sweep import job
+from xrgs.sweep.job import INTERRUPTED, LOCKED, UNWRITABLE, ProcessEnd, WorkError, run_in_child
 
 
 @pytest.fixture
@@ -38,7 +31,7 @@ def child(monkeypatch: pytest.MonkeyPatch) -> Callable[[ProcessEnd, object], Non
                 Path(command[-1]).write_text(json.dumps(answer))
             return end
 
-        monkeypatch.setattr(supervise, "run_supervised", run)
+        monkeypatch.setattr(job, "run_supervised", run)
 
     return stands_in
 
@@ -49,34 +42,31 @@ def test_the_answer_of_the_child_is_returned(child: Callable[..., None]) -> None
 
 
 @pytest.mark.parametrize(
-    ("end", "answer", "error", "message"),
+    ("end", "answer", "outcome", "message"),
     [
-        (ProcessEnd(0), {"error": "no photographs"}, WorkerError, "no photographs"),
-        (ProcessEnd(os.EX_TEMPFAIL), {"error": "x", "lost": True}, AttemptLostError, "x"),
-        (ProcessEnd(0), {"error": "x", "errno": errno.ENOSPC}, UnwritableError, "x"),
-        (ProcessEnd(0), {"error": "x", "errno": errno.EROFS}, UnwritableError, "x"),
-        (ProcessEnd(0), {"error": "x", "errno": errno.ENOENT}, WorkerError, "x"),
-        (ProcessEnd(0), {"error": "x", "errno": errno.ESTALE}, WorkerError, "x"),
-        (ProcessEnd(-signal.SIGTERM, "it took too long"), None, WorkerError, "it took too long"),
-        (ProcessEnd(os.EX_IOERR), None, UnwritableError, "is the disk full?"),
-        (ProcessEnd(3), None, WorkerError, "ended with exit code 3 before it answered"),
-        (ProcessEnd(-signal.SIGTERM), None, InterruptedWorkError, "ended by SIGTERM$"),
-        (ProcessEnd(-signal.SIGUSR2), None, InterruptedWorkError, "ended by SIGUSR2$"),
-        (ProcessEnd(-signal.SIGSEGV), None, WorkerError, "ended by SIGSEGV$"),
-        (ProcessEnd(-signal.SIGKILL), None, WorkerError, r"ended by SIGKILL \(out of memory\?\)"),
+        (ProcessEnd(0), {"error": "no photographs"}, "failed", "no photographs"),
+        (ProcessEnd(os.EX_TEMPFAIL), {"error": "x", "outcome": LOCKED}, LOCKED, "x"),
+        (ProcessEnd(0), {"error": "x", "outcome": UNWRITABLE}, UNWRITABLE, "x"),
+        (ProcessEnd(-signal.SIGTERM, "it took too long"), None, "failed", "it took too long"),
+        (ProcessEnd(os.EX_IOERR), None, UNWRITABLE, "is the disk full?"),
+        (ProcessEnd(3), None, "failed", "ended with exit code 3 before it answered"),
+        (ProcessEnd(-signal.SIGTERM), None, INTERRUPTED, "ended by SIGTERM$"),
+        (ProcessEnd(-signal.SIGUSR2), None, INTERRUPTED, "ended by SIGUSR2$"),
+        (ProcessEnd(-signal.SIGSEGV), None, "failed", "ended by SIGSEGV$"),
+        (ProcessEnd(-signal.SIGKILL), None, "failed", r"ended by SIGKILL \(out of memory\?\)"),
     ],
 )
 def test_what_went_wrong_in_the_child_is_raised(
     child: Callable[..., None],
     end: ProcessEnd,
     answer: object,
-    error: type[WorkerError],
+    outcome: str,
     message: str,
 ) -> None:
     child(end, answer)
-    with pytest.raises(WorkerError, match=message) as caught:
+    with pytest.raises(WorkError, match=message) as caught:
         run_in_child("cell", {"number": 1})
-    assert type(caught.value) is error
+    assert caught.value.outcome == outcome
 
 
 def test_a_machine_without_a_folder_for_temporary_files_is_told_what_to_set(
@@ -84,8 +74,9 @@ def test_a_machine_without_a_folder_for_temporary_files_is_told_what_to_set(
 ) -> None:
     monkeypatch.setattr(tempfile, "tempdir", None)
     monkeypatch.setattr(tempfile, "_candidate_tempdir_list", lambda: ["/gone"])
-    with pytest.raises(UnwritableError, match="set TMPDIR"):
+    with pytest.raises(WorkError, match="set TMPDIR") as caught:
         run_in_child("cell", {"number": 1})
+    assert caught.value.outcome == UNWRITABLE
 
 
 @pytest.fixture
@@ -93,17 +84,17 @@ def in_this_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Callable[[Callable[..., dict[str, Any]]], dict[str, Any]]:
     """(work) -> the answer that the child's `main` writes when it does this work."""
-    monkeypatch.setattr(supervise, "follow_parent", lambda: None)
+    monkeypatch.setattr(job, "follow_parent", lambda: None)
     monkeypatch.setattr(processes, "offer_to_oom_killer", lambda: None)
-    monkeypatch.setattr(worker, "guard_streams", lambda: None)
+    monkeypatch.setattr(job, "guard_streams", lambda: None)
     monkeypatch.setattr(faulthandler, "enable", lambda: None)
 
     def answered(work: Callable[..., dict[str, Any]]) -> dict[str, Any]:
-        monkeypatch.setitem(worker._JOBS, "cell", work)
+        monkeypatch.setitem(job._WORK, "cell", work)
         (tmp_path / "request").write_text('{"number": 1}')
-        worker.main("cell", str(tmp_path / "request"), str(tmp_path / "answer"))
+        job.main("cell", str(tmp_path / "request"), str(tmp_path / "answer"))
         answer = json.loads((tmp_path / "answer").read_text())
-        return {key: value for key, value in answer.items() if value not in ({}, None, False)}
+        return {key: value for key, value in answer.items() if value not in ({}, None, "failed")}
 
     return answered
 
@@ -123,8 +114,11 @@ def test_the_child_answers_with_the_result_or_the_error(
     }
     assert in_this_process(raising(XrgsError("no photographs"))) == {"error": "no photographs"}
     assert capsys.readouterr().err == ""
-    full = in_this_process(raising(OSError(errno.ENOSPC, "no room")))
-    assert full == {"error": "OSError: [Errno 28] no room", "errno": errno.ENOSPC}
+    for number in (errno.ENOSPC, errno.EROFS):
+        answer = in_this_process(raising(OSError(number, "no room")))
+        assert answer == {"error": f"OSError: [Errno {number}] no room", "outcome": UNWRITABLE}
+    stale = in_this_process(raising(OSError(errno.ESTALE, "stale")))
+    assert stale == {"error": "OSError: [Errno 116] stale"}
     other = in_this_process(raising(KeyError("k")))
     assert other == {"error": "KeyError: 'k'"}
     assert "Traceback" in capsys.readouterr().err
@@ -136,7 +130,7 @@ def test_a_child_that_can_not_write_its_answer_says_so_by_its_exit_code(
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "no room")
 
-    monkeypatch.setattr(worker, "write_json", full)
+    monkeypatch.setattr(job, "write_json", full)
     with pytest.raises(SystemExit) as end:
         in_this_process(lambda _: {})
     assert end.value.code == os.EX_IOERR
@@ -144,7 +138,7 @@ def test_a_child_that_can_not_write_its_answer_says_so_by_its_exit_code(
 
 def test_a_child_process_answers() -> None:
     """A process of its own, which fails before it needs torch."""
-    with pytest.raises(WorkerError, match="KeyError: 'conf'"):
+    with pytest.raises(WorkError, match="KeyError: 'conf'"):
         run_in_child("variant", {})
 
 
@@ -154,7 +148,7 @@ def test_a_child_whose_store_is_gone_leaves_it_to_its_parent_to_say_so(
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
 ) -> None:
-    monkeypatch.setattr(worker, "read_struct", lambda *_: {"store": str(tmp_path / "gone")})
+    monkeypatch.setattr(job, "read_struct", lambda *_: {"store": str(tmp_path / "gone")})
     answer = in_this_process(raising(FileNotFoundError(errno.ENOENT, "gone")))
-    assert answer["errno"] == errno.ENOENT
+    assert answer == {"error": "FileNotFoundError: [Errno 2] gone"}
     assert capsys.readouterr().err == ""

@@ -17,7 +17,6 @@ import pytest
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from xrgs.cli import sweep as command
 from xrgs.errors import XrgsError
 from xrgs.mixture import variant
 from xrgs.photos import scenes
@@ -26,9 +25,8 @@ from xrgs.safeio.atomic import write_json
 from xrgs.store import identity
 from xrgs.store.attempts import begin_attempt
 from xrgs.store.store import Store
-from xrgs.sweep.jobs import job as job_module
-from xrgs.sweep.jobs import worker
-from xrgs.sweep.jobs.job import (
+from xrgs.sweep import job as job_module
+from xrgs.sweep.job import (
     FAIL_FAST,
     GONE,
     INTERRUPTED,
@@ -36,7 +34,9 @@ from xrgs.sweep.jobs.job import (
     STOPPED,
     STORE_FULL,
     UNWRITABLE,
+    WorkError,
     _own_gpu,
+    run_hydra_job,
     run_job,
 )
 from xrgs.sweep.session import SweepSession
@@ -80,7 +80,7 @@ def requests(monkeypatch: pytest.MonkeyPatch, cells: Cells) -> list[tuple[str, M
         cells.finish(cells.store.cell(request["id"]))
         return {"found": ["formation: LR views: 0.83 px of blur across, 0.84 down"]}
 
-    monkeypatch.setattr(worker, "run_in_child", finish)
+    monkeypatch.setattr(job_module, "run_in_child", finish)
     return requested
 
 
@@ -179,16 +179,16 @@ def test_a_variant_that_was_removed_is_named(session: SweepSession, cells: Cells
 @pytest.mark.parametrize(
     ("error", "fail_fast", "outcome", "reason"),
     [
-        (worker.WorkerError("it raised"), True, "failed", FAIL_FAST),
-        (worker.WorkerError("it raised"), False, "failed", ""),
-        (worker.UnwritableError("a full disk"), True, UNWRITABLE, STORE_FULL),
+        (WorkError("it raised"), True, "failed", FAIL_FAST),
+        (WorkError("it raised"), False, "failed", ""),
+        (WorkError("a full disk", UNWRITABLE), True, UNWRITABLE, STORE_FULL),
     ],
 )
 def test_a_job_that_stops_the_others_says_why(
     session: SweepSession,
     cells: Cells,
     monkeypatch: pytest.MonkeyPatch,
-    error: worker.WorkerError,
+    error: WorkError,
     fail_fast: bool,
     outcome: str,
     reason: str,
@@ -196,7 +196,7 @@ def test_a_job_that_stops_the_others_says_why(
     def fail(*_: object) -> None:
         raise error
 
-    monkeypatch.setattr(worker, "run_in_child", fail)
+    monkeypatch.setattr(job_module, "run_in_child", fail)
     cell_id = cells.plan(fail_fast=fail_fast).id
     assert run(session, cells, cell_id) == outcome
     assert session.stopped == reason
@@ -231,9 +231,9 @@ def test_a_cell_whose_process_died_after_it_was_finished_is_done(
 ) -> None:
     def die_at_exit(_: str, request: Mapping[str, Any], *__: object) -> None:
         cells.finish(cells.store.cell(request["id"]))
-        raise worker.WorkerError("its process was ended by SIGSEGV")
+        raise WorkError("its process was ended by SIGSEGV")
 
-    monkeypatch.setattr(worker, "run_in_child", die_at_exit)
+    monkeypatch.setattr(job_module, "run_in_child", die_at_exit)
     assert run(session, cells, cells.plan().id) == "done"
 
 
@@ -263,7 +263,7 @@ def test_a_cell_ends_with_its_sweep_or_its_lease_and_is_unfinished(
             held[0].lost = True  # as its heartbeat finds
         on_poll(0)
 
-    monkeypatch.setattr(worker, "run_in_child", train)
+    monkeypatch.setattr(job_module, "run_in_child", train)
     cell = cells.plan()
     assert run(session, cells, cell.id) == outcome
     assert cell.state().name == "unfinished"
@@ -280,9 +280,9 @@ def test_a_cell_that_was_taken_over_is_left_as_it_is(
     def lose(*_: object) -> None:
         begin_attempt(cell)
         cells.finish(cell)
-        raise worker.AttemptLostError("another attempt at the cell has begun")
+        raise WorkError("another attempt at the cell has begun", LOCKED)
 
-    monkeypatch.setattr(worker, "run_in_child", lose)
+    monkeypatch.setattr(job_module, "run_in_child", lose)
     assert run(session, cells, cell.id) == LOCKED
     assert cell.state().name == "done"
 
@@ -308,8 +308,8 @@ def take_over(store: Store, cell_id: str) -> None:
     "end",
     [
         None,
-        worker.WorkerError("its process was ended by SIGKILL"),
-        worker.UnwritableError("no space"),
+        WorkError("its process was ended by SIGKILL"),
+        WorkError("no space", UNWRITABLE),
     ],
 )
 def test_a_job_whose_lease_was_taken_over_writes_nothing_from_then_on(
@@ -338,7 +338,7 @@ def test_a_job_whose_lease_was_taken_over_writes_nothing_from_then_on(
         assert not held[-1].beat()  # as its thread does
         on_poll(0)
 
-    monkeypatch.setattr(worker, "run_in_child", train)
+    monkeypatch.setattr(job_module, "run_in_child", train)
     assert run(session, cells, cell_id) == LOCKED
     assert content(cells.store.cell(cell_id).path) == before["cell"]
     assert content(cells.store.path / "locks") == before["locks"]
@@ -398,9 +398,9 @@ def test_a_cell_whose_status_can_not_be_read_when_its_child_has_died_keeps_it(
     def train(*_: object) -> None:
         (cells.store.cell(cell_id).path / "status.json").write_text('{"state": "done"}')
         sick("status.json", number)
-        raise worker.WorkerError("it raised")
+        raise WorkError("it raised")
 
-    monkeypatch.setattr(worker, "run_in_child", train)
+    monkeypatch.setattr(job_module, "run_in_child", train)
     assert run(session, cells, cell_id) == "failed"
     assert not (cells.store.cell(cell_id).path / "error.txt").exists()
 
@@ -415,16 +415,16 @@ def test_a_cell_that_is_asked_to_end_is_unfinished_and_slurm_decides_on_its_job(
     ends: bool,
 ) -> None:
     def train(*_: object) -> None:
-        raise worker.InterruptedWorkError("its process was ended by SIGTERM")
+        raise WorkError("its process was ended by SIGTERM", INTERRUPTED)
 
-    monkeypatch.setattr(worker, "run_in_child", train)
+    monkeypatch.setattr(job_module, "run_in_child", train)
     monkeypatch.setenv("SUBMITIT_EXECUTOR", executor)
     job_config.cell = cells.plan(fail_fast=True).id
     if ends:
         with pytest.raises(SystemExit, match=str(os.EX_TEMPFAIL)):
-            command._run_job(job_config)
+            run_hydra_job(job_config)
     else:
-        assert command._run_job(job_config) == INTERRUPTED
+        assert run_hydra_job(job_config) == INTERRUPTED
     assert cells.store.cell(job_config.cell).state().name == "unfinished"
     assert not list(cells.store.leases.iterdir())
     assert not session.stopped
@@ -451,10 +451,10 @@ def test_a_store_that_vanishes_while_a_cell_trains_does_not_reappear(
         elif how == "unmounted":
             cells.store.path.mkdir()
         if seen == "by the child":
-            raise worker.WorkerError("FileNotFoundError: no such file")
+            raise WorkError("FileNotFoundError: no such file")
         on_poll(0)
 
-    monkeypatch.setattr(worker, "run_in_child", train)
+    monkeypatch.setattr(job_module, "run_in_child", train)
     assert run(session, cells, cells.plan(fail_fast=True).id) == GONE
     assert "moved" not in capsys.readouterr().err  # the sweep says it once
     if how == "unmounted":
@@ -500,7 +500,7 @@ def test_a_launcher_s_worker_whose_sweep_has_ended_ends_without_an_answer(
     ended(session)
     monkeypatch.setattr(os, "_exit", end)
     with pytest.raises(ProcessEnded):
-        command._run_job(job_config)
+        run_hydra_job(job_config)
 
 
 def test_the_command_hands_a_cell_s_id_to_its_job(
@@ -510,7 +510,7 @@ def test_the_command_hands_a_cell_s_id_to_its_job(
     requests: list[tuple[str, Mapping[str, Any]]],
 ) -> None:
     job_config.cell = cells.plan().id
-    assert command._run_job(job_config) == "done"
+    assert run_hydra_job(job_config) == "done"
     assert len(requests) == 1
 
 

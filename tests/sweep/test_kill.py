@@ -1,6 +1,6 @@
 """Tests that a sweep killed by `kill -9` at random moments ends as if it had not been killed.
 
-`XRGS_KILLS=20 pytest tests/sweep/jobs/test_kill.py --log-cli-level=info` kills 20 times and logs
+`XRGS_KILLS=20 pytest tests/sweep/test_kill.py --log-cli-level=info` kills 20 times and logs
 each; with `XRGS_KILL_SEED=N` besides, it draws the same moments as the run that printed this seed.
 """
 
@@ -121,7 +121,7 @@ class KilledSweeps:
         workers = {
             pid: line.split()[-2:]
             for pid, line in self.sweeps.processes().items()
-            if "xrgs.sweep.jobs.worker" in line
+            if "xrgs.sweep.job" in line
         }
         victim = next(iter(workers), 0) if moment.worker else 0
         with suppress(ProcessLookupError):

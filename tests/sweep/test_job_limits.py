@@ -15,8 +15,8 @@ from pathlib import Path
 import pytest
 
 from xrgs.errors import XrgsError
-from xrgs.sweep.jobs import supervise
-from xrgs.sweep.jobs.supervise import Limits
+from xrgs.sweep import job
+from xrgs.sweep.job import Limits, ProcessEnd
 
 pytestmark = pytest.mark.slow
 
@@ -25,8 +25,8 @@ _STUBBORN = """
 import json, os, signal, subprocess, sys, time
 from functools import partial
 from pathlib import Path
-from xrgs.sweep.jobs import supervise
-supervise.follow_parent()
+from xrgs.sweep import job
+job.follow_parent()
 signal.signal(signal.SIGTERM, signal.SIG_IGN)
 signal.signal(signal.SIGUSR1, signal.SIG_IGN)
 child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
@@ -64,21 +64,17 @@ def wait(what: Callable[[], bool], seconds: float = 30.0) -> None:
 
 
 def test_a_process_that_ends_by_itself_gives_its_code_or_signal() -> None:
-    assert supervise.run_supervised(
-        python("raise SystemExit(3)"), Limits()
-    ) == supervise.ProcessEnd(3)
+    assert job.run_supervised(python("raise SystemExit(3)"), Limits()) == ProcessEnd(3)
     script = "import os; os.kill(os.getpid(), 9)"
-    assert supervise.run_supervised(python(script), Limits(1, 1)) == supervise.ProcessEnd(
-        -signal.SIGKILL
-    )
+    assert job.run_supervised(python(script), Limits(1, 1)) == ProcessEnd(-signal.SIGKILL)
 
 
 def test_a_process_that_hangs_is_killed_with_its_children_though_it_ignores_sigterm(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(supervise, "_LIMIT_GRACE_S", 0.5)
+    monkeypatch.setattr(job, "_LIMIT_GRACE_S", 0.5)
     pids = tmp_path / "pids"
-    ended = supervise.run_supervised(python(_STUBBORN, str(pids)), Limits(minutes=0.05))
+    ended = job.run_supervised(python(_STUBBORN, str(pids)), Limits(minutes=0.05))
     assert "limits.minutes=0.05" in ended.reason
     for pid in json.loads(pids.read_text()):
         wait(partial(gone, pid))
@@ -89,9 +85,9 @@ def test_memory_is_that_of_the_process_and_its_children(by: str) -> None:
     eats = _HUNGRY
     if by == "its child":
         eats = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {_HUNGRY!r}])"
-    ended = supervise.run_supervised(python(eats), Limits(memory_gb=0.2))
+    ended = job.run_supervised(python(eats), Limits(memory_gb=0.2))
     assert "limits.memory_gb=0.2" in ended.reason
-    assert supervise.run_supervised(python(_HUNGRY), Limits(memory_gb=4)).reason == ""
+    assert job.run_supervised(python(_HUNGRY), Limits(memory_gb=4)).reason == ""
 
 
 def test_an_exception_of_on_poll_ends_the_process() -> None:
@@ -103,7 +99,7 @@ def test_an_exception_of_on_poll_ends_the_process() -> None:
             raise XrgsError("enough")
 
     with pytest.raises(XrgsError, match="enough"):
-        supervise.run_supervised(python("import time; time.sleep(600)"), Limits(), on_poll)
+        job.run_supervised(python("import time; time.sleep(600)"), Limits(), on_poll)
     assert gone(polled[-1])
 
 
@@ -111,8 +107,8 @@ def test_an_exception_of_on_poll_ends_the_process() -> None:
 def test_no_child_outlives_its_parent(tmp_path: Path, how: signal.Signals) -> None:
     pids = tmp_path / "pids"
     script = (
-        "import sys; from xrgs.sweep.jobs import supervise; supervise._GRACE_S = 0.1;"
-        "supervise.run_supervised(sys.argv[1:], supervise.Limits())"
+        "import sys; from xrgs.sweep import job; job._GRACE_S = 0.1;"
+        "job.run_supervised(sys.argv[1:], job.Limits())"
     )
     command = python(script, *python(_STUBBORN, str(pids)))
     with subprocess.Popen(command, stderr=subprocess.DEVNULL) as parent:

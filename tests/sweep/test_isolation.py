@@ -27,7 +27,7 @@ Ended = tuple[int, str, str]
 SMOKE = ("scene=motorcycle", "preset=smoke", "train.steps=4")
 FAULTS = """
 import sys
-if "xrgs.sweep.jobs.worker" in sys.orig_argv and "cell" in sys.orig_argv:
+if "xrgs.sweep.job" in sys.orig_argv and "cell" in sys.orig_argv:
     import ctypes, errno, importlib, os, signal, subprocess, time, types
     from pathlib import Path
 

@@ -1,1 +1,0 @@
-"""Runs one cell's job: a child process under limits, whose parent holds the cell's lease."""
