@@ -1,4 +1,4 @@
-// The operations of simd.h for AVX2 with FMA: two registers a vector.
+// The operations of simd.h for AVX2 with FMA: two registers for each vector.
 #pragma once
 
 #include <immintrin.h>
@@ -8,7 +8,7 @@
 namespace xrgs {
 namespace XRGS_NS {
 
-// The number of vectors that the registers hold.
+// The number of vectors that fit in the registers.
 constexpr int kVectorRegisters = 8;
 constexpr bool kFusedMultiplyAdd = true;
 
@@ -248,5 +248,5 @@ XRGS_INLINE void stream_fence() { _mm_sfence(); }
 }  // namespace XRGS_NS
 }  // namespace xrgs
 
-// The operations that this instruction set has no better form of.
+// General forms of the remaining operations.
 #include "simd/generic.h"
