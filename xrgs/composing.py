@@ -260,8 +260,9 @@ def from_dict(values: Any) -> Conf:
         conf = msgspec.convert(values, Conf)
     except msgspec.ValidationError as error:
         message = str(error)
-        at = _AT.search(message)
-        raise XrgsError(f"{at[1]}: {message[: at.start()]}" if at else message) from error
+        if path := _AT.search(message):
+            message = f"{path[1]}: {message[: path.start()]}"
+        raise XrgsError(message) from error
     for name, settings in conf.components.plugins.items():
         if not isinstance(settings, dict):  # the plugin checks its settings
             key = f"components.plugins.{name}"

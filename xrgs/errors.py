@@ -50,11 +50,11 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
         `; did you mean A or B?`, or an empty text if no name is similar.
     """
     parts = {full: _last(full) for full in known}
-    own = _last(name)
-    similar = difflib.get_close_matches(own, parts.values(), cutoff=0.75)
-    found = [full for last in (own, *similar) for full in parts if parts[full] == last]
-    found = found or difflib.get_close_matches(name, parts)
-    offered = list(dict.fromkeys(found))[:_MAX_OFFERED]
+    last = _last(name)
+    similar = difflib.get_close_matches(last, parts.values(), cutoff=0.75)
+    names = [full for part in (last, *similar) for full in parts if parts[full] == part]
+    names = names or difflib.get_close_matches(name, parts)
+    offered = list(dict.fromkeys(names))[:_MAX_OFFERED]
     return f"; did you mean {' or '.join(offered)}?" if offered else ""
 
 

@@ -92,9 +92,9 @@ def code_digest(name: str, folders: CodeFolders) -> str:
     is_package = origin.stem == "__init__"
     base = origin.parent.parent if is_package else origin.parent
     files = _package_files(origin.parent) if is_package else [origin]
-    found = {file.relative_to(base).as_posix(): file for file in files}
-    found |= folders.needed_by(found.values())
-    return digest([point.value, digest_files(found)])
+    source_files = {file.relative_to(base).as_posix(): file for file in files}
+    source_files |= folders.needed_by(source_files.values())
+    return digest([point.value, digest_files(source_files)])
 
 
 def load(name: str) -> object:

@@ -76,10 +76,10 @@ def measure(
         setup = {"scene": files[RENDER], "views": {key: files[key] for key in (HR_STEP, LR_STEP)}}
         for worker in workers.values():
             worker.send(setup)
-        found: dict[str, Any] = {side: worker.answer() for side, worker in workers.items()}
+        answers: dict[str, Any] = {side: worker.answer() for side, worker in workers.items()}
         durations = _take_turns(workers, [*files], counts, repeats)
     sizes = {"scene": scene.sizes, "step": step[0].sizes}
-    return found | sizes | {"rows": summarize(durations, counts)}
+    return answers | sizes | {"rows": summarize(durations, counts)}
 
 
 class _Worker:
@@ -141,8 +141,8 @@ class _Worker:
     def _failure(self) -> XrgsError:
         self.process.wait()
         lines = self.log.read_text("utf-8", errors="replace").strip().splitlines()
-        said = " | ".join(lines[-_LAST_LINES:]) or f"ended with {self.process.returncode}"
-        return XrgsError(f"against: {self.python} cannot run the benchmark: {said}")
+        output = " | ".join(lines[-_LAST_LINES:]) or f"ended with {self.process.returncode}"
+        return XrgsError(f"against: {self.python} cannot run the benchmark: {output}")
 
 
 def _take_turns(

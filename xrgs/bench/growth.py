@@ -36,16 +36,16 @@ def fit_growth(rows: Sequence[Row]) -> list[Row]:
             "ms": frame["forward_ms"] + frame["backward_ms"],
         }
     )
-    found: list[Row] = []
+    fits: list[Row] = []
     for grows, fixed, name in (("Gaussians", "pixels", "size"), ("pixels", "Gaussians", "count")):
         for _, group in frame.sort_values(grows).groupby(fixed):
             if len(group) > 1:
                 fit = linregress(np.log(group[grows]), np.log(group["ms"]))
                 row = {"grows": grows, "at": group[name].iloc[0], "sizes": group[grows].tolist()}
-                found.append(row | {"ms": group["ms"].tolist(), "exponent": float(fit.slope)})
-    if len({row["grows"] for row in found}) == 2:
+                fits.append(row | {"ms": group["ms"].tolist(), "exponent": float(fit.slope)})
+    if len({row["grows"] for row in fits}) == 2:
         columns = [np.ones(len(frame)), np.log(frame["Gaussians"]), np.log(frame["pixels"])]
         _, *slopes = np.linalg.lstsq(np.stack(columns, axis=1), np.log(frame["ms"]), rcond=None)[0]
         for grows, slope in zip(("Gaussians", "pixels"), slopes, strict=True):
-            found.append({"grows": grows, "at": ALL_LOADS, "exponent": float(slope)})
-    return found
+            fits.append({"grows": grows, "at": ALL_LOADS, "exponent": float(slope)})
+    return fits

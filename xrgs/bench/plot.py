@@ -43,9 +43,9 @@ def draw_figure(results: Mapping[str, Any]) -> Figure:
     """Make the figure of `draw`. All panels except that of training steps are for one thread."""
     rows = [row for row in results["rows"] if row["threads"] == 1]
     load = largest_common_load(rows)
-    usual = rows[0]["method"]
+    first_method = rows[0]["method"]
     plain = [row for row in load if row["method"] in {row["backend"], TORCH_FLOAT64}]
-    cutoffs = [row for row in load if f"{row['method']},".startswith(f"{usual},")]
+    cutoffs = [row for row in load if f"{row['method']},".startswith(f"{first_method},")]
     panels: list[Callable[[Axes], None]] = [
         partial(_draw_errors, rows=plain, title="Which backend?", yscale="log"),
         partial(_draw_errors, rows=cutoffs, title="What do cutoffs cost?", yscale="linear"),

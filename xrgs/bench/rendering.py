@@ -55,13 +55,13 @@ def default_methods(backends: Sequence[str]) -> list[RenderMethod]:
     Args:
         backends: Names of the backends; only the first is measured with the other cut-offs.
     """
-    first, usual = backends[0], RasterSettings()
+    first, defaults = backends[0], RasterSettings()
     return [
         *(RenderMethod(name, name) for name in backends),
         RenderMethod(TORCH_FLOAT64, "torch", dtype=torch.float64),
-        RenderMethod(f"{first}, alpha cut 4/255", first, replace(usual, alpha_min=4 / 255)),
-        RenderMethod(f"{first}, alpha cut 1/1020", first, replace(usual, alpha_min=1 / 1020)),
-        RenderMethod(f"{first}, stop at 1e-2", first, replace(usual, transmittance_min=1e-2)),
+        RenderMethod(f"{first}, alpha cut 4/255", first, replace(defaults, alpha_min=4 / 255)),
+        RenderMethod(f"{first}, alpha cut 1/1020", first, replace(defaults, alpha_min=1 / 1020)),
+        RenderMethod(f"{first}, stop at 1e-2", first, replace(defaults, transmittance_min=1e-2)),
     ]
 
 
@@ -141,10 +141,10 @@ def time_load(
     slow = [method for method in methods if method.backend == "torch"]
     rows = time_methods(load, fast, counts, repeats)
     if len(load) <= _TORCH_GAUSSIANS and load.camera.width * load.camera.height <= _TORCH_PIXELS:
-        usual = {row["threads"]: total_ms(row) for row in reversed(rows)}  # the first method's
+        native_ms = {row["threads"]: total_ms(row) for row in reversed(rows)}  # the first method's
         for row in time_methods(load, slow, counts, min(repeats, _TORCH_REPEATS)):
             if fast:
-                row["times_slower"] = total_ms(row) / usual[row["threads"]]
+                row["times_slower"] = total_ms(row) / native_ms[row["threads"]]
             rows.append(row)
     error = errors(load, methods)
     return [row | error[row["method"]] for row in rows]
@@ -185,8 +185,8 @@ def time_methods(
             # Parameters and their gradients, and the buffers.
             "memory_mib": (2 * parameter_bytes + task.buffer_bytes) / 2**20,
         }
-        one = next((other for other in rows if other["method"] == row["method"]), row)
-        rows.append(row | {"speedup": total_ms(one) / total_ms(row)})
+        first_row = next((other for other in rows if other["method"] == row["method"]), row)
+        rows.append(row | {"speedup": total_ms(first_row) / total_ms(row)})
     return rows
 
 
@@ -198,9 +198,8 @@ def total_ms(row: Row) -> float:
 def errors(load: Load, methods: Sequence[RenderMethod]) -> dict[str, dict[str, float]]:
     """Compare each method with the torch backend in float64 at gsplat's settings.
 
-    Only the centre of the view (`ERROR_CROP`) is rendered.
-
-    All methods must have the same `sh_degree`.
+    Only the centre of the view (`ERROR_CROP`) is rendered. All methods must have the same
+    `sh_degree`.
 
     Returns:
         Name of a method -> `image_mean_error` and `image_max_error`, absolute errors of the image,
@@ -210,16 +209,16 @@ def errors(load: Load, methods: Sequence[RenderMethod]) -> dict[str, dict[str, f
     crop, threads = load.center_crop(*ERROR_CROP), torch.get_num_threads()
     exact = RenderMethod("exact", "torch", sh_degree=methods[0].sh_degree, dtype=torch.float64)
     exact_image, *exact_gradients = RenderTask(crop, exact, threads).results()
-    found = {}
+    method_errors = {}
     for method in methods:
         image, *gradients = RenderTask(crop, method, threads).results()
         difference = (image.double() - exact_image).abs()
-        found[method.name] = {
+        method_errors[method.name] = {
             "image_mean_error": difference.mean().item(),
             "image_max_error": difference.max().item(),
             "gradient_error": max(map(_relative_error, gradients, exact_gradients)),
         }
-    return found
+    return method_errors
 
 
 def _relative_error(value: Tensor, exact: Tensor) -> float:
@@ -239,49 +238,49 @@ def time_shortcuts(load: Load, backend: str, repeats: int) -> list[Row]:
         (whether image and gradients are equal on and off) and, with the prefixes `on_` and `off_`,
         times (ms), alpha evaluations and errors.
     """
-    usual = RenderMethod("on", backend)
+    all_on = RenderMethod("on", backend)
     rows = []
     if backend == "native":
-        without = [
+        one_off = [
             replace(
-                usual,
+                all_on,
                 name=option.name.replace("_", " "),
                 culling=replace(CullingOptions(), **{option.name: False}),
             )
             for option in fields(CullingOptions)
         ]
-        rows += _compare_shortcuts(load, usual, without, repeats)
+        rows += _compare_shortcuts(load, all_on, one_off, repeats)
     # Early in training only band 0 is on. Without the shortcut, the other bands, all zeros, are
     # evaluated too.
     sh = torch.cat([load.sh[:, :1], torch.zeros_like(load.sh[:, 1:])], dim=1)
-    without = [replace(usual, name=INACTIVE_BANDS)]
-    usual = replace(usual, sh_degree=0)
-    return rows + _compare_shortcuts(replace(load, sh=sh), usual, without, repeats)
+    one_off = [replace(all_on, name=INACTIVE_BANDS)]
+    all_on = replace(all_on, sh_degree=0)
+    return rows + _compare_shortcuts(replace(load, sh=sh), all_on, one_off, repeats)
 
 
 def _compare_shortcuts(
-    load: Load, usual: RenderMethod, without: Sequence[RenderMethod], repeats: int
+    load: Load, all_on: RenderMethod, one_off: Sequence[RenderMethod], repeats: int
 ) -> list[Row]:
-    methods = [usual, *without]
+    methods = [all_on, *one_off]
     timed = {row["method"]: row for row in time_methods(load, methods, [1], repeats)}
     error = errors(load, methods)
     sides = {
         name: {key: row[key] for key in ("forward_ms", "backward_ms", "evaluations")} | error[name]
         for name, row in timed.items()
     }
-    active = bases(usual.sh_degree) - 1  # bases of shN whose gradients are compared
-    *expected, expected_harmonics = RenderTask(load, usual, 1).results()
+    active = bases(all_on.sh_degree) - 1  # bases of shN whose gradients are compared
+    *expected, expected_harmonics = RenderTask(load, all_on, 1).results()
     rows = []
-    for method in without:
-        *found, harmonics = RenderTask(load, method, 1).results()
-        same = all(map(torch.equal, found, expected))
+    for method in one_off:
+        *gradients, harmonics = RenderTask(load, method, 1).results()
+        same = all(map(torch.equal, gradients, expected))
         same &= torch.equal(harmonics[:, :active], expected_harmonics[:, :active])
-        on, off = sides[usual.name], sides[method.name]
+        on, off = sides[all_on.name], sides[method.name]
         rows.append(
             {
                 "shortcut": method.name,
                 **load.sizes,
-                "backend": usual.backend,
+                "backend": all_on.backend,
                 "threads": 1,
                 **{f"on_{key}": value for key, value in on.items()},
                 **{f"off_{key}": value for key, value in off.items()},

@@ -152,8 +152,8 @@ def time_steps(
         ms["densify"] /= step.settings.every
         row: Row = {"view": view, "backend": backend, "threads": count, **step.load.sizes}
         row |= {f"{part}_ms": value for part, value in ms.items()} | {"step_ms": sum(ms.values())}
-        one = next((other for other in rows if other["view"] == view), row)
-        rows.append(row | {"speedup": one["step_ms"] / row["step_ms"]})
+        first_row = next((other for other in rows if other["view"] == view), row)
+        rows.append(row | {"speedup": first_row["step_ms"] / row["step_ms"]})
     return rows
 
 
@@ -193,8 +193,8 @@ def loss_gradients(load: Load, backend: str) -> tuple[Callable[[], Tensor], ...]
         with use_threads(1):
             used = target if prepared else prepare_target(photograph, backend=backend)
             loss = photometric_loss(image, used, l1=L1, ssim=SSIM, backend=backend)
-            found: Tensor = torch.autograd.grad(loss, image)[0]
-            return found
+            v_image: Tensor = torch.autograd.grad(loss, image)[0]
+            return v_image
 
     return partial(gradient, prepared=True), partial(gradient, prepared=False)
 

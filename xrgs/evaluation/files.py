@@ -1,4 +1,4 @@
-"""Scores the render in a file, for example of another program."""
+"""Scores a render that is stored in a file, by another program for example."""
 
 from __future__ import annotations
 

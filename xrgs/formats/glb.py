@@ -111,13 +111,13 @@ def _attributes(gaussians: Gaussians) -> dict[str, Array]:
     means, quats, scales, opacities, sh0, shN = (
         gaussians[name].detach().double().numpy() for name in PARAMETERS
     )
-    with np.errstate(over="ignore", invalid="ignore"):  # refused later
+    with np.errstate(over="ignore", invalid="ignore"):  # NaN is refused later
         alpha = 1 / (1 + np.exp(-opacities))
         linear = {"SCALE": np.exp(scales), "ROTATION": quats[:, [1, 2, 3, 0]], "OPACITY": alpha}
         attributes = {f"{EXTENSION}:{name}": values for name, values in linear.items()}
         sh = np.concatenate([sh0, shN], axis=1)  # [N, K, 3]
-        for name, at in _harmonics(sh.shape[1]).items():
-            attributes[name] = sh[:, at]
+        for name, index in _harmonics(sh.shape[1]).items():
+            attributes[name] = sh[:, index]
         floats = {name: values.astype("<f4") for name, values in attributes.items()}
         colors = _fallback_colors(sh0[:, 0], alpha)
     return {"POSITION": means.astype("<f4"), **floats, "COLOR_0": colors}
@@ -126,11 +126,11 @@ def _attributes(gaussians: Gaussians) -> dict[str, Array]:
 def _harmonics(count: int) -> dict[str, int]:
     """Return attribute name -> index of the coefficient."""
     names = [
-        f"{EXTENSION}:SH_DEGREE_{band}_COEF_{of}"
+        f"{EXTENSION}:SH_DEGREE_{band}_COEF_{order}"
         for band in range(math.isqrt(count))
-        for of in range(2 * band + 1)
+        for order in range(2 * band + 1)
     ]
-    return {name: at for at, name in enumerate(names)}
+    return {name: index for index, name in enumerate(names)}
 
 
 def _fallback_colors(sh0: Array, alpha: Array) -> Array:
@@ -237,10 +237,12 @@ def _read(path: Path, content: bytes) -> SavedGaussians:
     }
     check_arrays_finite(path, arrays)
     gaussians = _gaussians(arrays)
-    own = description["nodes"][node].get("extras", {})
-    if not own.get(_DISPLAY):
+    extras = description["nodes"][node].get("extras", {})
+    if not extras.get(_DISPLAY):
         world = _to_world(description["nodes"], node)
-        turn = Rotation.from_quat(own[_TURNED_BY]).as_matrix() if _TURNED_BY in own else _DOWN_TO_UP
+        turn = _DOWN_TO_UP
+        if _TURNED_BY in extras:
+            turn = Rotation.from_quat(extras[_TURNED_BY]).as_matrix()
         world[:3] = turn.T @ world[:3]
         try:
             gaussians = transformed(gaussians, world)
@@ -268,16 +270,16 @@ def _chunks(content: bytes) -> tuple[Json, bytes]:
 
 def _model(description: Json) -> tuple[int, Json]:
     """Return the node and the primitive of the only model of Gaussians."""
-    found = [
+    models = [
         (number, primitive)
         for number, node in enumerate(description.get("nodes", []))
         if "mesh" in node
         for primitive in description["meshes"][node["mesh"]]["primitives"]
         if EXTENSION in primitive.get("extensions", {})
     ]
-    if len(found) != 1:
-        raise ValueError(f"has {len(found)} models of {EXTENSION}; one is read")
-    return found[0]
+    if len(models) != 1:
+        raise ValueError(f"has {len(models)} models of {EXTENSION}; one is read")
+    return models[0]
 
 
 def _array(description: Json, binary: bytes, number: int) -> NDArray[np.float64]:
@@ -304,7 +306,7 @@ def _array(description: Json, binary: bytes, number: int) -> NDArray[np.float64]
 
 def _gaussians(arrays: Mapping[str, NDArray[np.float64]]) -> Gaussians:
     bands = [_harmonics(bases(degree)) for degree in range(MAX_DEGREE + 1)]
-    names = max((of for of in bands if of.keys() <= arrays.keys()), key=len, default=bands[0])
+    names = max((band for band in bands if band.keys() <= arrays.keys()), key=len, default=bands[0])
     widths = {"POSITION": 3, **dict.fromkeys(names, 3)}
     widths |= {
         f"{EXTENSION}:{name}": width
@@ -337,13 +339,13 @@ def _gaussians(arrays: Mapping[str, NDArray[np.float64]]) -> Gaussians:
 
 def _to_world(nodes: Sequence[Json], node: int) -> NDArray[np.float64]:
     """Return the global transformation [4, 4] of a node."""
-    parents = {child: at for at, of in enumerate(nodes) for child in of.get("children", [])}
-    matrix, at = np.eye(4), node
+    parents = {child: i for i, parent in enumerate(nodes) for child in parent.get("children", [])}
+    matrix, number = np.eye(4), node
     for _ in nodes:  # bounded, since a damaged file may have a cycle
-        matrix = _local(nodes[at]) @ matrix
-        if at not in parents:
+        matrix = _local(nodes[number]) @ matrix
+        if number not in parents:
             break
-        at = parents[at]
+        number = parents[number]
     return matrix
 
 

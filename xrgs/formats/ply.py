@@ -168,8 +168,8 @@ def read_ply(path: Path) -> SavedGaussians:
 
 
 def _is_antialiased(comments: Sequence[str]) -> bool:
-    found = [match for text in comments if (match := _RENDER_MODE.fullmatch(text.lower()))]
-    return bool(found) and (found[-1][1] == "mip" or found[-1][2] == "1")
+    matches = [match for text in comments if (match := _RENDER_MODE.fullmatch(text.lower()))]
+    return bool(matches) and (matches[-1][1] == "mip" or matches[-1][2] == "1")
 
 
 def _properties(rest: int) -> list[str]:
@@ -229,7 +229,7 @@ def _filtered(scales: Table, opacities: Table, sizes: NDArray[np.float64]) -> tu
 
     The formula is in `xrgs.training.components.mip`.
     """
-    with np.errstate(over="ignore", invalid="ignore"):  # refused later
+    with np.errstate(over="ignore", invalid="ignore"):  # NaN is refused later
         variances = np.exp(2 * scales.astype(np.float64))
         filtered = variances + sizes**2
         alpha = 1 / (1 + np.exp(-opacities.astype(np.float64)))

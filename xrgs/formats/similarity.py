@@ -55,7 +55,7 @@ def transformed(gaussians: Gaussians, similarity: NDArray[np.float64]) -> Gaussi
         "sh0": gaussians.sh0.detach(),
         "shN": _turned_harmonics(gaussians.shN.detach().double(), torch.from_numpy(rotation)),
     }
-    return Gaussians(**{name: of.float().clone().requires_grad_() for name, of in values.items()})
+    return Gaussians(**{name: x.float().clone().requires_grad_() for name, x in values.items()})
 
 
 def _product(turn: Rotation, quats: Tensor) -> Tensor:
@@ -77,8 +77,8 @@ def _turned_harmonics(coefficients: Tensor, turn: Tensor) -> Tensor:
     before, after = sh_basis(degree, dirs @ turn), sh_basis(degree, dirs)  # [64, K]
     turned = torch.zeros_like(coefficients)
     for band in range(1, degree + 1):
-        of = slice(bases(band - 1), bases(band))
-        mixing = torch.linalg.lstsq(after[:, of], before[:, of]).solution  # [2l + 1, 2l + 1]
-        rest = slice(of.start - 1, of.stop - 1)
+        columns = slice(bases(band - 1), bases(band))
+        mixing = torch.linalg.lstsq(after[:, columns], before[:, columns]).solution  # [2l+1, 2l+1]
+        rest = slice(columns.start - 1, columns.stop - 1)
         turned[:, rest] = torch.einsum("jk,nkc->njc", mixing, coefficients[:, rest])
     return turned

@@ -104,9 +104,9 @@ def write_spz(path: Path, gaussians: Gaussians, *, antialiased: bool = False) ->
     _warn_of_clipped(
         path,
         {"coordinates": (fixed, -limit, limit)}
-        | {name: (of, -1, 256) for name, of in stored.items()},
+        | {name: (values, -1, 256) for name, values in stored.items()},
     )
-    colors, log_scales, harmonics = (_to_bytes(of).tobytes() for of in stored.values())
+    colors, log_scales, harmonics = (_to_bytes(values).tobytes() for values in stored.values())
     content = [
         _HEADER.pack(_MAGIC, 3, len(means), degree, bits, flags, 0),
         fixed.clip(-limit, limit).astype("<i4").view(np.uint8).reshape(-1, 4)[:, :3].tobytes(),
@@ -221,16 +221,16 @@ def _read(path: Path, content: bytes) -> SavedGaussians:
 
 def _named_axes(path: Path, extensions: bytes) -> int:
     """Return the number of the axes in the file's extensions; 0 if they name no axes."""
-    axes, at = 0, 0
-    while at + _EXTENSION.size <= len(extensions):
-        kind, length = _EXTENSION.unpack_from(extensions, at)
-        at += _EXTENSION.size + length
-        if at > len(extensions):
+    axes, offset = 0, 0
+    while offset + _EXTENSION.size <= len(extensions):
+        kind, length = _EXTENSION.unpack_from(extensions, offset)
+        offset += _EXTENSION.size + length
+        if offset > len(extensions):
             raise ValueError("ends within an extension")
         if kind != _AXES_EXTENSION:
             _log.warning("%s: has the extension %#010x, which is not read", path, kind)
             continue
-        axes = int.from_bytes(extensions[at - length : at], "little")
+        axes = int.from_bytes(extensions[offset - length : offset], "little")
         if length != 4 or axes > _MOST_AXES:
             raise ValueError(f"its extension {kind:#x} names axes {axes}, not 0 to {_MOST_AXES}")
     return axes

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import zlib  # noqa: F401  pycolmap 4.2.1 corrupts the heap where it is imported before zlib
+import zlib  # noqa: F401  pycolmap 4.2.1 corrupts the heap if it is imported before zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -410,7 +410,7 @@ def _crop(image: NDArray[_T], hr: HrGeometry) -> NDArray[_T]:
 def _read_headers(
     files: Mapping[str, Path],
 ) -> tuple[dict[str, images.Header], dict[str, str]]:
-    """Read the headers: file name -> header of a photograph, and file name -> why it is none."""
+    """Read the headers: name -> header of a photograph, and name -> why it is not usable."""
     headers: dict[str, images.Header] = {}
     left_out: dict[str, str] = {}
     for name, file in files.items():

@@ -6,7 +6,7 @@ COLMAP's log goes to files in the work folder; the user sees a progress bar for 
 from __future__ import annotations
 
 import tempfile
-import zlib  # noqa: F401  pycolmap 4.2.1 corrupts the heap where it is imported before zlib
+import zlib  # noqa: F401  pycolmap 4.2.1 corrupts the heap if it is imported before zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -82,7 +82,7 @@ class Reconstruction:
     report: dict[str, Any]
     """Settings and results, with the keys of the variant's report."""
     world: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
-    """The rigid transform [4, 4] from the world of given poses to this one."""
+    """The rigid transform [4, 4] from the world of given poses to the world of `viewmats`."""
     apart: Mapping[int, int] = field(default_factory=dict)
     """Image that fits better with another camera than the shared one -> number of that camera
     (`xrgs.mixture.own_cameras`)."""

@@ -44,7 +44,7 @@ def resolve_backend(name: str) -> str:
         `native`, `torch` or `gsplat`.
 
     Raises:
-        ValueError: The name is none of the four.
+        ValueError: The name is unknown.
         XrgsError: The native backend is configured or required, and was not built; or gsplat is
             configured, and is missing or of an unsupported version.
     """

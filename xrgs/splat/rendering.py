@@ -67,7 +67,7 @@ def rasterize(
         settings: How Gaussians become pixels; None takes the defaults of `RasterSettings`.
         sh_degree: Highest evaluated band of the spherical harmonics, 0 to 3; None takes all stored
             bands, up to `settings.sh_degree`.
-        backend: `native`, `torch`, `gsplat` (on a GPU), or `auto`: native for float32 where the
+        backend: `native`, `torch`, `gsplat` (on a GPU), or `auto`: native for float32 if the
             extension was built, else torch.
 
     Returns:

@@ -237,7 +237,7 @@ def _densify(run: _Run, step: Step, forward: _Forward) -> Refinement:
     grad2d, camera = forward.means2d_offset.grad, forward.camera
     visible = forward.render.visible
     if grad2d is not None:
-        if step.view.mask is not None:  # a view shows only what is inside its mask
+        if step.view.mask is not None:  # masked pixels show no Gaussian
             visible = visible & (grad2d != 0).any(dim=1)
         grad2d = run.components.densification_grad2d(grad2d, step)
     refinement = run.strategy.after_step(

@@ -246,8 +246,8 @@ template <int R>
 XRGS_INLINE Floats broadcast_row(Floats a) {
   return {a.v[R], a.v[R], a.v[R], a.v[R]};
 }
-// The lanes k of p[(16 C + k) / 3], which may read up to p[16], and of p[(16 C + k) % 3], which may
-// read up to p[3]. C is 0 to 2.
+// repeat_thrice has p[(16 C + k) / 3] in lane k, and may read up to p[16]. repeat_triple has
+// p[(16 C + k) % 3] in lane k, and may read up to p[3]. C is 0 to 2.
 template <int C>
 XRGS_INLINE Floats repeat_thrice(const float* p) {
   const auto at = [p](int k) { return p[(16 * C + k) / 3]; };

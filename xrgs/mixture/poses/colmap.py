@@ -65,7 +65,7 @@ def files(root: Path) -> list[Path]:
     """Return the files of the model in or below a folder; of several models, the largest one.
 
     Returns:
-        cameras, images and, if there, points3D; empty if there is no model.
+        The paths of cameras, images and, if it exists, points3D; empty if there is no model.
 
     Raises:
         OSError: A folder can't be read.
@@ -201,7 +201,7 @@ def _models(root: Path) -> list[list[Path]]:
 
 
 def _complete(folder: Path) -> list[Path] | None:
-    """Return cameras, images and, if there, points of the model in a folder.
+    """Return the paths of cameras, images and, if they exist, points of the model in a folder.
 
     If the model has no points3D, a .ply is taken for it. Of several models, those with points have
     precedence, then those with names without a prefix, then the first.

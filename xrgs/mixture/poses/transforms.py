@@ -215,7 +215,7 @@ def _lens(entry: Mapping[str, Any], stored: tuple[int, int]) -> Lens:
 
 def _model(entry: Mapping[str, Any], terms: Mapping[str, float]) -> str:
     """Return the name of COLMAP's camera model."""
-    if entry.get("is_fisheye"):  # of instant-ngp
+    if entry.get("is_fisheye"):  # instant-ngp's key
         return "OPENCV_FISHEYE"
     name = str(entry.get("camera_model", "OPENCV")).upper()
     if name not in _OPENCV:
@@ -229,7 +229,7 @@ def _focal(entry: Mapping[str, Any], axis: str, side: int) -> float | None:
     if entry.get(f"fl_{axis}") is not None:
         return as_number(entry[f"fl_{axis}"])
     angle = entry.get(f"camera_angle_{axis}")
-    if angle is None and entry.get(f"{axis}_fov") is not None:  # of instant-ngp, in degrees
+    if angle is None and entry.get(f"{axis}_fov") is not None:  # instant-ngp's key, in degrees
         angle = math.radians(as_number(entry[f"{axis}_fov"]))
     if angle is None:
         return None

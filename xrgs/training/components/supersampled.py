@@ -168,7 +168,7 @@ class Supersampled(Component):
         return camera.resized(camera.width // self.zoom, camera.height // self.zoom)
 
     def _factors(self) -> str:
-        """Return text with the number of views for each k, and if different after `late_from`."""
+        """Return a text: the number of views for each k, first and, if different, late."""
         settings = self.settings
         early, late = (
             ", ".join(f"{count} at {k}" for k, count in sorted(counts.items()))
