@@ -11,9 +11,9 @@ from xrgs.splat.rounding import rounded_sqrt
 def rotation_matrices(quats: Tensor) -> Tensor:
     """Convert quaternions of any length to rotation matrices.
 
-    As gsplat's `_quat_to_rotmat` (`cuda/_torch_impl.py`), except in two cases that give NaN or
-    infinity there: a zero quaternion is the identity, with a gradient of zero, and squares of
-    components may overflow or underflow.
+    As gsplat's `_quat_to_rotmat` (`cuda/_torch_impl.py`), and defined in two more cases: a zero
+    quaternion is the identity, with a gradient of zero, and the squares of components may overflow
+    or underflow.
 
     Args:
         quats: [M, 4] w, x, y, z.

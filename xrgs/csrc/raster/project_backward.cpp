@@ -125,7 +125,7 @@ struct GeometryGradient {
 };
 
 // Whether all gradients of the visible Gaussians are finite. The gradients of shN need no test:
-// they are products of the colour's gradient and a basis function.
+// they are products of the colour's gradient and a basis function, which is at most 1.
 XRGS_INLINE bool all_finite(const GeometryGradient& v, const Vector3& v_color, Floats v_opacity,
                             Floats v_offset_x, Floats v_offset_y, std::uint32_t visible) {
   const Floats zero = broadcast(0.0f);

@@ -98,7 +98,7 @@ class Strategy(ABC):
             width: Width of the render, px.
             height: Height of the render, px.
             group: Group of the view; only read if there are groups.
-            hooks: Decisions of the training components, for strategies that `asks_components`.
+            hooks: Decisions of the training components; ignored unless `asks_components`.
 
         Returns:
             The numbers of changed Gaussians.

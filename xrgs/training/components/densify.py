@@ -17,7 +17,7 @@ class Densify(Component):
     """Gives LR views their own thresholds of growth and pruning.
 
     Section 5.4 of the paper has two sets of thresholds for the adaptive density control of 3D
-    Gaussian Splatting [kerbl2023, section 5.2; gsplat's `DefaultStrategy`, ye2025]:
+    Gaussian Splatting [kerbl2023, section 5.2], as in gsplat's `DefaultStrategy` [ye2025]:
 
         threshold_HR < threshold_LR
 

@@ -39,7 +39,8 @@ class Floaters(Component):
 
     Gaussians are removed at step 0, at every multiple of `splat.densify.every`, also after
     densification, and at the last step. Hiding them in v would not help test views, which would
-    still show them.
+    still show them. The training views also protect a test view between them, since their empty
+    spaces overlap.
 
     The component is our choice.
 

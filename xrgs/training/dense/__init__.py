@@ -7,7 +7,7 @@ multi-view stereo with the variant's poses:
 1. A plane sweep [collins1996] compares every view with its nearest neighbours, at planes between
    the depths of its SfM points, evenly spaced in inverse depth (`depths`, `matching`).
 2. Semi-global matching [hirschmuller2008] smooths the costs (`semiglobal`).
-3. A depth is kept if neighbours have the same depth, and if fewer views contradict it (`checks`).
+3. A depth is kept if neighbours have it too, and more views confirm than contradict it (`checks`).
 4. Each place of the scene is assigned to the view that samples it most finely.
 5. A quadtree over the pixels assigned to each view is split where colours differ, until the number
    of leaves reaches the budget; each leaf becomes a Gaussian (`quadtree`, `surface`).
