@@ -3,7 +3,7 @@
 Given the same inputs, the results are those of `DefaultStrategy` of gsplat [ye2025] 1.5.3, with two
 exceptions:
 
-- Opacities are reset. gsplat 1.5.3 never resets them by mistake: Python reads its condition
+- Opacities are reset. By mistake, gsplat 1.5.3 never resets them: Python reads its condition
   `step % reset_every == 0 & step > 0` as a comparison with `0 & step` (pull request 776 fixes it).
   `DensifySettings.resets` of False is the behaviour of 1.5.3.
 - A split draws its random numbers in double.
