@@ -5,18 +5,18 @@ ablations of Cross-Resolution Gaussian Splatting, and reports percentage-change 
 
 From Python, `import xrgs` gives:
 
-- `load_gaussians`, `save_gaussians`, `Gaussians`, `Camera`: Gaussians in and out as .ply, .glb or
-  .spz, and views of them.
-- `rasterize`: render Gaussians with a camera, with settings in `RasterSettings`; gives a `Render`.
+- `load_gaussians`, `save_gaussians`: read and write .ply, .glb and .spz files of `Gaussians`.
+- `rasterize`: render `Gaussians` with a `Camera` and `RasterSettings` to a `Render`.
   `xrgs.formats.gsplat_api` has `rasterization`, with gsplat's signature and results.
-- `compose`: the config of a command line; `build_dataset` or `load_dataset`: what it is trained on;
-  `train`: train it.
+- `compose`: make the config of a command line; `build_dataset` or `load_dataset`: make or load its
+  training data; `train`: train it.
 - `Store`: the results of sweeps as tables and objects.
 
-Each name is imported when it is first used, so that planning a sweep never waits for torch.
-Importing the package sets OMP_WAIT_POLICY to `passive` where the environment has no value: torch's
-threads then sleep between its loops, and leave the cores to the kernels. torch reads it when it is
-loaded, so import xrgs first.
+Each name is imported when it is first used, so that planning a sweep does not import torch.
+
+Importing the package sets OMP_WAIT_POLICY to `passive` unless the environment has a value. Then
+torch's threads sleep between its loops, and leave the cores to the kernels. torch reads the
+variable when it is imported, so import xrgs first.
 """
 
 from __future__ import annotations
@@ -57,9 +57,9 @@ __all__ = [
     "train",
 ]
 
-#: Public names that differ from those in their modules.
+#: Public name -> name in its module, if they differ.
 _NAMES_IN_MODULES = {"train": "train_cell"}
-#: The module of each public name; the imports above say the same to type checkers and editors.
+#: Public name -> its module. The imports above are the same, for type checkers and editors.
 _MODULES = {
     "Camera": "xrgs.splat.cameras",
     "Gaussians": "xrgs.splat.gaussians",
@@ -75,22 +75,22 @@ _MODULES = {
     "save_gaussians": "xrgs.formats.files",
     "train": "xrgs.training.count_matching",
 }
-#: Names of version 0.2 that the next one removes: their modules, and what to use.
+#: Name of version 0.2 that the next version removes -> its module, and its replacement.
 _DEPRECATED = {
     "load_ply": ("xrgs.formats.ply", "xrgs.load_gaussians(path).gaussians"),
     "rasterization": ("xrgs.formats.gsplat_api", "xrgs.formats.gsplat_api.rasterization"),
     "save_ply": ("xrgs.formats.ply", "xrgs.save_gaussians"),
 }
-#: Names that render on the processor, where threads of torch that spin take the cores.
+#: Names that render on the CPU, and are slow if torch's threads spin between its loops.
 _RENDERING = ("rasterize", "train")
-#: Whether torch's threads spin: it was loaded first, with no policy in the environment. A warning
-#: sets it back.
+#: Whether torch's threads spin, since torch was imported before xrgs, without a policy in the
+#: environment. The first warning sets it to False.
 _SPINNING = "torch" in sys.modules and "OMP_WAIT_POLICY" not in os.environ
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 
 def warn_of_spinning() -> None:
-    """Warn once where torch's threads spin between its loops, and say what to do."""
+    """Warn once, with a remedy, if torch's threads spin between its loops."""
     if not _SPINNING:
         return
     globals()["_SPINNING"] = False
@@ -103,7 +103,7 @@ def warn_of_spinning() -> None:
     )
 
 
-if not TYPE_CHECKING:  # else type checkers would take any name to be there
+if not TYPE_CHECKING:  # or type checkers would accept any name
 
     def __getattr__(name: str) -> Any:
         """Import a public name when it is first used (PEP 562)."""
@@ -122,5 +122,5 @@ if not TYPE_CHECKING:  # else type checkers would take any name to be there
 
 
 def __dir__() -> list[str]:
-    """List the public names, those that are not imported yet too."""
+    """List the public names, including those that are not imported yet."""
     return sorted({*globals(), *__all__})

@@ -1,6 +1,6 @@
-"""The compiled kernels of `xrgs/csrc`: the types of what each family's bind.cpp defines.
+"""The types of the compiled kernels, which the bind.cpp files of `xrgs/csrc` define.
 
-Their docstrings are in the module (`help(xrgs._native)`). Tensors and arrays are float32 unless
+The docstrings are in the module (`help(xrgs._native)`). Tensors and arrays are float32 unless
 noted, on the CPU and contiguous.
 """
 
@@ -104,8 +104,8 @@ class Frame:
         self, config: RenderConfig, *inputs: Tensor | int | None
     ) -> tuple[Tensor, Tensor]: ...
     # The inputs are the gradients of image and alpha, the six parameters, means2d_offset or None,
-    # whether the gradient of shN is needed, and the number of threads. The last of the results says
-    # whether all gradients are finite.
+    # whether the gradient of shN is needed, and the number of threads. The last result is whether
+    # all gradients are finite.
     def backward(self, *inputs: Tensor | int | None) -> tuple[*tuple[Tensor | None, ...], bool]: ...
     def visible(self) -> Tensor: ...
     @property

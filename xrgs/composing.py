@@ -1,7 +1,7 @@
-"""Makes configs and checks them: of a command line, of nested dicts, of the file of a cell.
+"""Makes and checks configs from a command line, from nested dicts, and from the file of a cell.
 
-Hydra and OmegaConf are imported where a config is composed, and not where one is read back: the
-process of a cell works without them.
+Hydra and OmegaConf are imported only to compose a config, so that the process of a cell, which
+reads its config from a file, does not need them.
 """
 
 from __future__ import annotations
@@ -34,27 +34,27 @@ if TYPE_CHECKING:
 
     from xrgs.splat.settings import OptimizerSettings
 
-#: The start of an interpolation, with the backslashes before it: an odd number of them escapes it.
+#: The start of an interpolation and the backslashes before it; an odd number escapes it.
 _INTERPOLATION = re.compile(r"(\\*)\$\{")
-#: Where msgspec found an error, at the end of its message: "... - at `$.train.steps`".
+#: The key at the end of msgspec's error messages: "... - at `$.train.steps`".
 _AT = re.compile(r" - at `\$\.?(.*)`$")
-#: What `conf/config.yaml` has in place of a value that a file of `conf/scene/` sets.
+#: Placeholder in `conf/config.yaml` for a value that the files of `conf/scene/` set.
 _OPEN = "???"
 _RETRY = ("none", "failed")
 _HYDRA_LOCK = threading.Lock()
 
 
 def compose(*overrides: str) -> Conf:
-    """Return the config that a command line of `xrgs-sweep` would give to a cell.
+    """Compose the config of a cell, as `xrgs-sweep` does from its command line.
 
     Args:
         overrides: Hydra overrides without axes, as `preset=smoke`, `+ablation=consistency` or
-            `train.steps=100`; none gives the baseline of `conf/config.yaml`.
+            `train.steps=100`. Without overrides, the config is the baseline of `conf/config.yaml`.
 
     Raises:
-        HydraException: An override is malformed, or there is no such key or file.
-        OmegaConfBaseException: A value is missing or of another type; the message names its key.
-        XrgsError: A value is out of its range; the message names its key.
+        HydraException: An override is malformed, or its key or file does not exist.
+        OmegaConfBaseException: A value is missing or of the wrong type; the message names its key.
+        XrgsError: A value is out of range; the message names its key.
 
     Examples:
         >>> compose("preset=smoke", "train.steps=100").train.steps
@@ -66,10 +66,10 @@ def compose(*overrides: str) -> Conf:
 
 @contextmanager
 def _own_hydra() -> Iterator[ModuleType]:
-    """Initialise Hydra with the config of this package, and leave the caller's own as it was.
+    """Initialise Hydra with the config of this package, and afterwards restore the caller's state.
 
-    Hydra, its `version_base` and the name of its job are one each in a process. A notebook or a
-    function of `@hydra.main` may be using them, and several threads may compose at once.
+    Hydra, its `version_base` and its job name are global in a process. A notebook or a function of
+    `@hydra.main` may be using them, and several threads may compose concurrently.
     """
     import hydra
     from hydra.core.global_hydra import GlobalHydra
@@ -89,17 +89,17 @@ def _own_hydra() -> Iterator[ModuleType]:
 
 
 def to_conf(cfg: DictConfig) -> Conf:
-    """Convert a config that Hydra composed, and check its ranges and choices.
+    """Convert a config from Hydra to a `Conf`, and check ranges and choices.
 
     Args:
         cfg: A config composed from `conf/config.yaml`, whose defaults contain the schema.
 
     Returns:
-        The config, its interpolations resolved.
+        The config, with resolved interpolations.
 
     Raises:
         OmegaConfBaseException: A value is missing; the message names its key.
-        XrgsError: A value is out of its range or of another type, or a key is unknown; the message
+        XrgsError: A value is out of range or of the wrong type, or a key is unknown; the message
             names the key.
     """
     from omegaconf import OmegaConf
@@ -123,7 +123,7 @@ def to_conf(cfg: DictConfig) -> Conf:
 
 
 def _expand_home(conf: Conf) -> None:
-    """Put the user's home folder in place of `~` in every path."""
+    """Replace `~` by the user's home folder in every path."""
     for key in PATHS:
         *groups, name = key.split(".")
         group = reduce(getattr, groups, conf)
@@ -142,7 +142,7 @@ def _check_integers(values: dict[str, Any], path: str = "") -> None:
 
 
 def _check_ranges(conf: Conf) -> None:
-    """Raise `XrgsError` where a number is out of its range; the message names its key."""
+    """Raise `XrgsError` for a number out of range; the message names its key."""
     least_values = (
         ("splat.optimizer.shN_every", conf.splat.optimizer.shN_every, 1),
         ("seed", conf.seed, 0),
@@ -170,7 +170,7 @@ def _check_ranges(conf: Conf) -> None:
 
 
 def _check_optimizer(optimizer: OptimizerSettings) -> None:
-    """Raise `XrgsError` where a schedule of the learning rates is out of its range."""
+    """Raise `XrgsError` for settings of the learning rates out of range."""
     for name in ("means_decay_from", "length_decay_from"):
         if not 0 <= (begin := getattr(optimizer, name)) < NOMINAL_STEPS:
             raise XrgsError(
@@ -182,7 +182,7 @@ def _check_optimizer(optimizer: OptimizerSettings) -> None:
 
 
 def _check_sfm_seed(conf: Conf) -> None:
-    """Raise `XrgsError` where COLMAP can't hold its seed."""
+    """Raise `XrgsError` if the seed of SfM is too large for COLMAP."""
     if (seed := conf.variant.sfm.seed) >= 2**31:
         raise XrgsError(
             f"variant.sfm.seed={seed}: must be below 2^31 = {2**31}, as COLMAP holds it"
@@ -190,7 +190,7 @@ def _check_sfm_seed(conf: Conf) -> None:
 
 
 def _check_choices(conf: Conf) -> None:
-    """Raise `XrgsError` where a word is none of those that its key may have."""
+    """Raise `XrgsError` for a value that is not among the choices of its key."""
     for key, value, accepted in (
         ("train.views", conf.train.views, TRAINING_VIEWS),
         ("splat.backend", conf.splat.backend, CHOICES),
@@ -204,7 +204,7 @@ def _check_choices(conf: Conf) -> None:
 
 
 def _check_strategy(conf: Conf) -> None:
-    """Raise `XrgsError` where a setting has no meaning for the strategy of densification."""
+    """Raise `XrgsError` for a setting that the strategy of densification ignores."""
     densify = conf.splat.densify
     if conf.splat.strategy == "default":
         if densify.noise:
@@ -229,29 +229,29 @@ def _check_strategy(conf: Conf) -> None:
             )
 
 
-#: Former groups of `components` that are plugins of the same name now: the key that switched each
-#: on, and its value where it was off.
+#: Former group of `components`, now a plugin of the same name -> the key that switched it on, and
+#: the key's value if it was off.
 _FORMER_GROUPS = {
     "error_score": ("of", "nothing"),
     "multiview_score": ("views", 0),
     "noise_weighting": ("floor", 1.0),
     "skip_backward": ("share", 1.0),
 }
-#: The ablations that were part of xrgs and are in the package `examples/arms` now.
+#: Ablations that were part of xrgs, and are now in the package `examples/arms`.
 ARMS = frozenset({*_FORMER_GROUPS, "mip_off_late", "near_gradients"})
 
 
 def from_dict(values: Any) -> Conf:
-    """Convert what `dataclasses.asdict` made of a config back to the config.
+    """Convert the nested dicts of `dataclasses.asdict` back to a config.
 
-    Texts are taken literally: a path may contain `${`, and a file of unknown origin must not read
-    this process's environment.
+    Interpolations are not resolved: a path may contain `${`, and a file of unknown origin must not
+    read this process's environment.
 
     Args:
         values: Nested dicts of plain values, with every key.
 
     Raises:
-        XrgsError: A key is unknown or missing, or a value is of another type; the message names
+        XrgsError: A key is unknown or missing, or a value is of the wrong type; the message names
             the key.
     """
     for _, _, key in _missing(values, Conf):
@@ -260,10 +260,11 @@ def from_dict(values: Any) -> Conf:
         conf = msgspec.convert(values, Conf)
     except msgspec.ValidationError as error:
         message = str(error)
-        at = _AT.search(message)
-        raise XrgsError(f"{at[1]}: {message[: at.start()]}" if at else message) from error
+        if path := _AT.search(message):
+            message = f"{path[1]}: {message[: path.start()]}"
+        raise XrgsError(message) from error
     for name, settings in conf.components.plugins.items():
-        if not isinstance(settings, dict):  # the plugin itself checks what is in it
+        if not isinstance(settings, dict):  # the plugin checks its settings
             key = f"components.plugins.{name}"
             raise XrgsError(
                 f"{key}={settings}: must be a mapping of settings, e.g. +{key}.weight=0.1"
@@ -272,10 +273,10 @@ def from_dict(values: Any) -> Conf:
 
 
 def _missing(values: Any, schema: Any, path: str = "") -> Iterator[tuple[Any, str, str]]:
-    """Yield the keys of a schema that nested dicts lack: the dict, the name in it, the dotted key.
+    """Yield each key that is missing in nested dicts: the dict, the name in it, the dotted key.
 
-    msgspec would take the defaults of `xrgs.splat.settings` for missing keys, and ignore unknown
-    ones, for which this raises `XrgsError`.
+    msgspec would use the defaults of `xrgs.splat.settings` for missing keys, and ignore unknown
+    keys; for unknown keys this raises `XrgsError`.
     """
     if not isinstance(values, dict):
         return  # msgspec refuses it
@@ -298,7 +299,7 @@ def escape_interpolations(value: Any) -> Any:
         value: A text, or any nesting of dicts and lists of values.
 
     Returns:
-        The same with `\${` in place of `${`, and with twice the backslashes that come before it.
+        The value with each `${` replaced by `\${`, and the backslashes before it doubled.
     """
     if isinstance(value, dict):
         return {name: escape_interpolations(inner) for name, inner in value.items()}
@@ -310,21 +311,20 @@ def escape_interpolations(value: Any) -> Any:
 
 
 def from_file(file: Path) -> tuple[Conf, dict[str, Any]]:
-    """Read the config that a cell's folder holds as JSON.
+    """Read the config in a cell's folder, a JSON file.
 
-    A file from before a key was added lacks it. The key's value in `conf/config.yaml` is taken,
-    with which all that was added is off. A file from when a component of `examples/arms` was part
-    of xrgs has its settings elsewhere; they become those of the plugin where it was on.
+    Keys that were added after the file was written get their value from `conf/config.yaml`, which
+    means "off". Settings of components that have moved to `examples/arms` become those of the
+    plugin, if the component was on.
 
     Args:
         file: The JSON file.
 
     Returns:
-        The config, and the keys that the file lacks with the values that were taken.
+        The config, and missing key -> value that was inserted.
 
     Raises:
-        XrgsError: The file can't be read, or has another schema; the message names the file and
-            the key.
+        XrgsError: The file can't be read, or has another schema; the message names file and key.
     """
     values = read_struct(file, Any)
     added = {}
@@ -340,7 +340,7 @@ def from_file(file: Path) -> tuple[Conf, dict[str, Any]]:
 
 
 def _move_to_plugins(values: Any) -> None:
-    """Move the settings of components that have become plugins, in place; what is off goes."""
+    """Move settings of former components to their plugins, in place; drop those that are off."""
     components = values.get("components") if isinstance(values, dict) else None
     if not isinstance(components, dict):
         return  # `_missing` refuses it
@@ -364,7 +364,7 @@ def _move_to_plugins(values: Any) -> None:
 
 @cache
 def _baseline() -> Any:
-    """Return the values of `conf/config.yaml` itself as nested dicts."""
+    """Return the values of `conf/config.yaml` as nested dicts."""
     from omegaconf import OmegaConf
 
     conf = cast("DictConfig", OmegaConf.load(CONF_DIR / "config.yaml"))
@@ -372,13 +372,13 @@ def _baseline() -> Any:
 
 
 def error_line(error: Exception) -> str:
-    """Return the first line of an error's message, with the key that it is about.
+    """Return the first line of an error's message, with the config's key.
 
     Args:
-        error: Any exception. Those of OmegaConf know their key, and do not always print it.
+        error: Any exception. OmegaConf's exceptions have a key, which the message may lack.
 
     Returns:
-        One line, that begins with the key where the message does not contain it.
+        One line, prefixed with the key if the message does not contain it.
     """
     line, key = str(error).splitlines()[0], getattr(error, "full_key", None)
     return line if not key or key in line else f"{key}: {line}"

@@ -1,8 +1,8 @@
 """The schema of a config: every key and its type.
 
-`conf/config.yaml` has the value, the unit, the source and the meaning of each key, and
-`xrgs-sweep help=KEY` prints them. The keys of the model are declared in `xrgs.splat.settings`,
-which works without this module. `xrgs.composing` makes configs.
+`conf/config.yaml` has the value, unit, source and meaning of each key; `xrgs-sweep help=KEY` prints
+them. The keys of the model are declared in `xrgs.splat.settings`, which does not depend on this
+module. `xrgs.composing` makes configs.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ if TYPE_CHECKING:
     from dataclasses import Field
 
 _PACKAGE = Path(__file__).parent
-#: `conf/` is inside the package in a wheel and beside it in a checkout.
+#: Folder of the config's files: inside the package in a wheel, next to it in a checkout.
 CONF_DIR = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else _PACKAGE.parent / "conf"
 
-#: The values of `train.views`.
+#: Allowed values of `train.views`.
 TRAINING_VIEWS = ("mixed", "all_hr", "hr_only", "lr_only")
-#: The groups of files that a sweep is made of. The first two are not in the defaults list of
-#: `conf/config.yaml`, so that Hydra requires a plus before them.
+#: Config groups that an override needs a plus for, since they are not in the defaults list of
+#: `conf/config.yaml`; then all config groups.
 PLUS_GROUPS = ("ablation", "sweeps")
 GROUPS = (*PLUS_GROUPS, "scene", "preset", "variant")
-#: The keys whose values are paths; `~` in them is the user's home folder.
+#: Keys whose values are paths, in which `~` is the user's home folder.
 PATHS = ("scene.path", "scene.masks", "variant.poses", "store", "data_root")
 
 
 def off(value: Any) -> Any:
-    """Declare a key and the value at which it changes nothing; identities leave it out there."""
+    """Declare a key, and its value that means "off". At this value it is in no cell's id."""
     return field(metadata={"off": value})
 
 
@@ -78,7 +78,7 @@ class PhoneConf:
 
 @dataclass(kw_only=True)
 class VariantConf:
-    """The mixed-resolution dataset that is made of a scene (paper, section 4.1)."""
+    """The mixed-resolution dataset that is made from a scene (paper, section 4.1)."""
 
     long_side: int
     factor: int
@@ -165,7 +165,7 @@ class RenderScaleConf:
 
 @dataclass(kw_only=True)
 class SupersampledConf:
-    """LR views rendered larger and brought down as their photographs were; not in the paper."""
+    """Coarse views rendered larger, then downsampled as their photographs; not in the paper."""
 
     factor: int = off(1)
     late_factor: int = off(1)
@@ -174,7 +174,7 @@ class SupersampledConf:
 
 @dataclass(kw_only=True)
 class FormationConf:
-    """How LR photographs were made, learned: the width of their blur; not in the paper."""
+    """Trained widths of the blur of LR photographs; not in the paper."""
 
     widths: str = off("none")
     lr: float
@@ -201,14 +201,14 @@ class ConsistencyConf:
 
 @dataclass(kw_only=True)
 class AdaptiveWeightingConf:
-    """A higher weight of LR views in scenes of little texture (paper, section 7.2, 1)."""
+    """Higher weight of LR views in scenes with little texture (paper, section 7.2, 1)."""
 
     texture: float = off(0.0)
 
 
 @dataclass(kw_only=True)
 class RegionWeightingConf:
-    """Full weight of smooth or HR-less regions of LR views (paper, section 7.2, 2)."""
+    """Full weight of regions of LR views that are smooth or in no HR view (paper, 7.2, 2)."""
 
     texture: float = off(0.0)
 
@@ -222,7 +222,7 @@ class HybridScheduleConf:
 
 @dataclass(kw_only=True)
 class ContinuousWeightingConf:
-    """A weight by a view's sampling rate in place of loss weighting's (paper, conclusion)."""
+    """Loss weights by the views' sampling rates instead of their tags (paper, conclusion)."""
 
     gamma: float = off(0.0)
 
@@ -237,7 +237,7 @@ class MipConf:
 
 @dataclass(kw_only=True)
 class NaturalSelectionConf:
-    """Gaussians that fade under a common push are removed (GNS); not in the paper."""
+    """Removal of Gaussians that fade under a constant opacity gradient (GNS); not in the paper."""
 
     budget: float = off(0.0)
     until: int
@@ -246,7 +246,7 @@ class NaturalSelectionConf:
 
 @dataclass(kw_only=True)
 class ExposureConf:
-    """A learned colour map of each photograph; not in the paper."""
+    """A trained colour map for each photograph; not in the paper."""
 
     mode: str = off("none")
     lr: float
@@ -256,7 +256,7 @@ class ExposureConf:
 
 @dataclass(kw_only=True)
 class FloatersConf:
-    """A guard against Gaussians in the empty space close to cameras."""
+    """Removal of Gaussians in the empty space close to cameras; not in the paper."""
 
     near_share: float = off(0.0)
 
@@ -271,7 +271,7 @@ class RegularizationConf:
 
 @dataclass(kw_only=True)
 class CountMatchedConf:
-    """A cell with as many Gaussians as another one (`xrgs.training.count_matching`)."""
+    """Training with the number of Gaussians of another cell (`xrgs.training.count_matching`)."""
 
     gaussians: int = off(0)
     tolerance: float
@@ -279,7 +279,7 @@ class CountMatchedConf:
 
 @dataclass(kw_only=True)
 class ComponentsConf:
-    """The components of XR-GS; each group but `plugins` has a key that switches it on."""
+    """The components; each group except `plugins` has a key that switches it on."""
 
     loss_weighting: LossWeightingConf
     gradient_scaling: GradientScalingConf
@@ -306,7 +306,7 @@ class ComponentsConf:
 
 @dataclass(kw_only=True)
 class LimitsConf:
-    """What a cell may use before it is ended and counts as failed."""
+    """Limits of time and memory; a cell that exceeds them is ended and counts as failed."""
 
     minutes: float
     memory_gb: float
@@ -314,7 +314,7 @@ class LimitsConf:
 
 @dataclass(kw_only=True)
 class LpipsConf:
-    """The weights of LPIPS, which are not shipped."""
+    """The download of LPIPS's weights, which are not part of xrgs."""
 
     fetch: bool
 
@@ -344,7 +344,7 @@ class Conf:
 
 
 def is_on(group: Any) -> bool:
-    """Return whether a group of keys has a key that `off` declares and that is not off."""
+    """Return whether any key of a group declared by `off` has another value than "off"."""
     return any(
         "off" in key.metadata and not _is_off(key, getattr(group, key.name))
         for key in fields(group)
@@ -352,16 +352,16 @@ def is_on(group: Any) -> bool:
 
 
 def identity_values(group: Any) -> dict[str, Any]:
-    """Return the values of a group of keys as nested dicts, without the keys that are off.
+    """Return the values of a group as nested dicts, without the keys that are off.
 
-    A component that is off is left out with all its keys. So a new key with its off value, or a new
-    component that is off, changes no result.
+    A component that is off is left out with all its keys. So adding a key or a component that is
+    off by default changes no id.
 
     Args:
         group: A dataclass of the schema, as `Conf.splat` or `Conf.components`.
 
     Returns:
-        The values as JSON has them: a tuple becomes a list.
+        JSON values: tuples become lists.
     """
     values: dict[str, Any] = {}
     for key in fields(group):
@@ -380,11 +380,11 @@ def _is_off(key: Field[Any], value: Any) -> bool:
 
 @cache
 def known_keys() -> tuple[str, ...]:
-    """Return what may stand before the `=` of an override.
+    """Return the keys that an override may set.
 
     Returns:
-        The groups of files (`scene`), and every key of the schema with the keys that contain others
-        (`train`, `train.steps`).
+        The config groups (`scene`), and all keys and groups of keys of the schema (`train.steps`,
+        `train`).
     """
     return tuple(dict.fromkeys((*GROUPS, *_keys_of(Conf, ""))))
 
@@ -398,5 +398,5 @@ def _keys_of(schema: Any, prefix: str) -> Iterator[str]:
 
 @cache
 def types_of(schema: Any) -> Mapping[str, Any]:
-    """Return the types of a group's keys, by name."""
+    """Return name -> type, of a group's keys."""
     return get_type_hints(schema)

@@ -1,4 +1,4 @@
-"""The errors that a user can fix: a command prints their message alone, without a traceback."""
+"""The errors that a user can fix: commands print only the message, without a traceback."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-#: The most names that are offered in place of one that does not exist.
+#: Largest number of suggested names.
 _MAX_OFFERED = 3
 
 
 class XrgsError(Exception):
-    """Something outside the program is wrong; the message names the file, key or parameter.
+    """An error in a file, a key or a parameter, which the message names.
 
     Examples:
         >>> try:
@@ -26,36 +26,35 @@ class XrgsError(Exception):
 
 
 class StoreError(XrgsError):
-    """A store can't be used, or one of its files is missing, damaged or not what it should be."""
+    """A store can't be used, or one of its files is missing, damaged or of the wrong content."""
 
 
 class UnreadableError(StoreError):
-    """A file can't be read now, because of its permissions or because a disk or a server fails.
+    """A file can't be read at the moment, because of permissions or a failing disk or server.
 
-    Nothing is known of its content: it is neither missing nor damaged, and is to be read again.
+    The file is neither missing nor known to be damaged: reading it again later may work.
     """
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Return the end of a message about a name that does not exist: names that are like it.
+    """Return the end of an error message about an unknown name: suggestions of similar names.
 
-    A name is like another one whose last part is the same as its own (`fern` and `llff/fern`,
-    `steps` and `train.steps`) or has nearly the same letters; if there is none, like one that has
-    nearly the same letters in all.
+    Names are similar if their last parts are equal (`fern` and `llff/fern`, `steps` and
+    `train.steps`) or nearly equal. If no last part is similar, whole names are compared.
 
     Args:
-        name: The name that does not exist.
-        known: The names that exist, whose parts a dot or a slash separates.
+        name: The unknown name.
+        known: The existing names, with parts separated by a dot or a slash.
 
     Returns:
-        `; did you mean A or B?`, or an empty text where no name is like it.
+        `; did you mean A or B?`, or an empty text if no name is similar.
     """
     parts = {full: _last(full) for full in known}
-    own = _last(name)
-    similar = difflib.get_close_matches(own, parts.values(), cutoff=0.75)
-    found = [full for last in (own, *similar) for full in parts if parts[full] == last]
-    found = found or difflib.get_close_matches(name, parts)
-    offered = list(dict.fromkeys(found))[:_MAX_OFFERED]
+    last = _last(name)
+    similar = difflib.get_close_matches(last, parts.values(), cutoff=0.75)
+    names = [full for part in (last, *similar) for full in parts if parts[full] == part]
+    names = names or difflib.get_close_matches(name, parts)
+    offered = list(dict.fromkeys(names))[:_MAX_OFFERED]
     return f"; did you mean {' or '.join(offered)}?" if offered else ""
 
 

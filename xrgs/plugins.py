@@ -1,13 +1,13 @@
 """Components of other installed packages, found by their entry points.
 
-A package offers a component by an entry point in the group `xrgs.components`; its name is the key
-under `components.plugins` of the config. To find a plugin and to hash its source for identities
-executes none of its code. `load` does; training calls it for the names in the config of its cell
-alone. The config comes from the user's command line and files; a config from a store is trained
-again only if the user has named its plugins (`xrgs.sweep.rerun`). So a store from elsewhere never
-makes xrgs import a package.
+A package provides a component by an entry point in the group `xrgs.components`; the name of the
+entry point is the key under `components.plugins` of the config. Finding a plugin and hashing its
+source for identities executes none of its code. Only `load` imports it, and training calls `load`
+only for the plugins in the cell's config. That config comes from the user's command line and files;
+a config from a store is trained again only if the user names its plugins (`xrgs.sweep.rerun`). So a
+store from another person never makes xrgs import a package.
 
-This module does not import torch, so that planning and reporting can use it.
+This module does not import torch, so that planning and reporting stay quick.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ if TYPE_CHECKING:
     from xrgs.safeio.code import CodeFolders
 
 GROUP = "xrgs.components"
-"""The entry point group in which packages offer components."""
+"""The entry point group of components."""
 
 _BYTECODE = frozenset({".pyc", ".pyo"})
 _Settings = TypeVar("_Settings")
 
 
 def installed() -> list[str]:
-    """Return the names of the plugins that installed packages offer, sorted."""
+    """Return the sorted names of the plugins in all installed packages."""
     return sorted({point.name for point in entry_points(group=GROUP)})
 
 
@@ -51,7 +51,7 @@ def find(name: str) -> EntryPoint:
         The entry point; its value is `package.module:Class`.
 
     Raises:
-        XrgsError: No installed package offers the plugin, or several do.
+        XrgsError: No installed package has the plugin, or several have it.
     """
     points = list(entry_points(group=GROUP, name=name))
     if not points:
@@ -71,14 +71,13 @@ def find(name: str) -> EntryPoint:
 def code_digest(name: str, folders: CodeFolders) -> str:
     """Return a digest of a plugin's source, without importing its package.
 
-    It covers the entry point's value and every file of the package that the entry point names (or
-    of the module, where that is a single file) but bytecode and hidden files. It covers the modules
-    of built-in components that these files import, which a plugin may extend. What the package
-    imports from other packages is not covered.
+    It covers the value of the entry point, all files of its package except bytecode and hidden
+    files (or the file of a single module), and the modules of built-in components that these files
+    import, to extend them for example. It does not cover imports from other packages.
 
     Args:
         name: The name of the plugin.
-        folders: The code of xrgs that trains; built-in components are parts of it.
+        folders: The code of xrgs that trains, with the built-in components.
 
     Raises:
         XrgsError: The plugin is not installed, or has no source file.
@@ -93,19 +92,19 @@ def code_digest(name: str, folders: CodeFolders) -> str:
     is_package = origin.stem == "__init__"
     base = origin.parent.parent if is_package else origin.parent
     files = _package_files(origin.parent) if is_package else [origin]
-    found = {file.relative_to(base).as_posix(): file for file in files}
-    found |= folders.needed_by(found.values())
-    return digest([point.value, digest_files(found)])
+    source_files = {file.relative_to(base).as_posix(): file for file in files}
+    source_files |= folders.needed_by(source_files.values())
+    return digest([point.value, digest_files(source_files)])
 
 
 def load(name: str) -> object:
-    """Import a plugin's package and return what its entry point names.
+    """Import a plugin's package and return the object of its entry point.
 
     Args:
         name: The name of the plugin.
 
     Returns:
-        The object, for the caller to check.
+        The object; the caller checks its type.
 
     Raises:
         XrgsError: The plugin is not installed, or cannot be imported.
@@ -113,7 +112,7 @@ def load(name: str) -> object:
     point = find(name)
     try:
         return point.load()
-    except Exception as error:  # whatever a module may raise while it is imported
+    except Exception as error:  # importing may raise any error
         raise XrgsError(
             f"components.plugins.{name}: importing {point.value} failed:"
             f" {type(error).__name__}: {error}"
@@ -125,16 +124,16 @@ def parse_settings(kind: type[_Settings], values: Mapping[str, Any], key: str) -
 
     Args:
         kind: The dataclass of the settings. Fields of type bool, int, float or str are checked; a
-            float takes whole numbers as well. Fields of other types are passed as they are.
-        values: The values by their names.
+            float accepts whole numbers. Fields of other types are passed unchecked.
+        values: Name -> value.
         key: The key of the plugin in the config, for messages.
 
     Returns:
-        The settings, with defaults for what is not in `values`.
+        The settings, with defaults for missing values.
 
     Raises:
-        XrgsError: A name is unknown, a value is missing or of another type; the message names the
-            key.
+        XrgsError: A name is unknown, or a value is missing or of the wrong type; the message names
+            the key.
     """
     hints = get_type_hints(kind)
     fields = {field.name: field for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
@@ -153,7 +152,7 @@ def parse_settings(kind: type[_Settings], values: Mapping[str, Any], key: str) -
 
 
 def _typed(key: str, value: Any, kind: Any) -> Any:
-    """The value as a bool, int, float or str; of another kind, as it is."""
+    """Convert a value to bool, int, float or str; return it unchecked for any other type."""
     if kind not in {bool, int, float, str}:
         return value
     if kind is float and type(value) is int:
@@ -164,10 +163,10 @@ def _typed(key: str, value: Any, kind: Any) -> Any:
 
 
 def _origin(module: str) -> Path | None:
-    """The file of the first package or module in a dotted name that is no namespace package.
+    """Return the file of the first part of a dotted name that is not a namespace package.
 
-    `importlib.util.find_spec` imports the parents of a dotted name. Namespace packages have no
-    code, so that only the first name that has code is needed, and it is found without an import.
+    `importlib.util.find_spec` imports the parents of a dotted name, but namespace packages have no
+    code. So the first part with code is found without importing code.
     """
     first, *rest = module.split(".")
     spec: ModuleSpec | None
@@ -185,7 +184,7 @@ def _origin(module: str) -> Path | None:
 
 
 def _package_files(folder: Path) -> Iterator[Path]:
-    """Every file of a package in a fixed order, but bytecode and hidden files."""
+    """Yield the files of a package in a fixed order, except bytecode and hidden files."""
     for file in sorted(folder.rglob("*")):
         parts = file.relative_to(folder).parts
         hidden = any(part.startswith(".") for part in parts)

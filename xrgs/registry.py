@@ -1,7 +1,7 @@
-"""The components of xrgs, by the keys of `components` in the config.
+"""The built-in components, by their keys under `components` in the config.
 
-To add a component, write its module in `components/` and add its entry here. This module imports
-neither torch nor the components, so that planning can read it.
+To add a component, write its module in `training/components/`, and add an entry here. This module
+imports neither torch nor the components, so that planning stays quick.
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ _FOLDER = "training/components"
 
 @dataclass(frozen=True)
 class ComponentEntry:
-    """Where a component is."""
+    """Module and class of a component."""
 
     module: str
     """Module of `xrgs.training.components`."""
     name: str
-    """Class in that module."""
+    """Class in the module."""
     reads: tuple[str, ...] = ()
-    """Further keys of `components` that the class reads."""
+    """Further groups of `components` that the class reads."""
 
 
-#: In the order in which hooks run. The weights of views come after `consistency`, since they
-#: multiply its loss as well, and before `regularization`, whose penalties have no weight of a view.
+#: Key -> entry, in the order of the hooks. `loss_weighting` comes after `consistency`, whose loss
+#: it multiplies too, and before `regularization`, whose penalties it does not multiply.
 BUILT_IN: Mapping[str, ComponentEntry] = {
     "consistency": ComponentEntry("consistency", "Consistency"),
     "loss_weighting": ComponentEntry(
@@ -53,14 +53,15 @@ BUILT_IN: Mapping[str, ComponentEntry] = {
 
 
 def file_of(key: str) -> str | None:
-    """Return the source file of the component that a key of `components` switches on.
+    """Return the source file of the component for a group of `components` in the config.
 
     Args:
-        key: A key of `BUILT_IN`, or one that an entry reads. `plugins` and `count_matched` have no
-            component here.
+        key: A key of `BUILT_IN`, or a group that an entry reads. `plugins` and `count_matched` have
+            no component here.
 
     Returns:
-        Its path in the package, such as `training/components/weighting.py`; None without one.
+        The file's path in the package, such as `training/components/weighting.py`; None if there
+        is no component.
     """
     for own_key, entry in BUILT_IN.items():
         if key == own_key or key in entry.reads:
@@ -69,7 +70,7 @@ def file_of(key: str) -> str | None:
 
 
 def order_of(keys: Iterable[str]) -> str:
-    """Return the classes of the components that are on, in the order in which their hooks run."""
+    """Return a text of the classes of the components that are on, in the order of their hooks."""
     on = set(keys)
     entries = (entry for key, entry in BUILT_IN.items() if on & {key, *entry.reads})
     return " ".join(f"{entry.module}:{entry.name}" for entry in entries)

@@ -1,1 +1,1 @@
-"""The benchmark of `xrgs-bench`: run time against error, training steps, skips, memory, growth."""
+"""The benchmark of `xrgs-bench`: run time, error, memory, and what each optimisation saves."""

@@ -1,8 +1,8 @@
-"""Compares this installation of xrgs with another one: `xrgs-bench --against PYTHON`.
+"""Compares the speed of this installation of xrgs with another: `xrgs-bench --against PYTHON`.
 
-Each installation runs `xrgs.bench.against_worker` of its own in a process that stays alive, and is
-asked for one repetition at a time. The two take turns, so that the ratio of two neighbouring
-repetitions stays true on a machine with other work.
+Each installation runs its `xrgs.bench.against_worker` in a process, which runs one repetition for
+each request. The two processes take turns, so that other work on the machine slows both down, and
+the ratio of two consecutive repetitions stays valid.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ if TYPE_CHECKING:
     from xrgs.bench.loads import Load
     from xrgs.bench.timing import Row
 
-    #: Milliseconds of each repetition, by side, task and number of threads.
+    #: (side, task, number of threads) -> time of each repetition, ms.
     Durations = Mapping[tuple[str, str, int], NDArray[np.float64]]
 
-HR_SHARE = 0.3  # of high-resolution views among the steps of a mixed-resolution training
+HR_SHARE = 0.3  # fraction of HR steps in a mixed-resolution training
 SIDES = ("this", "other")
 RENDER, HR_STEP, LR_STEP, MEAN_STEP = "render", "HR step", "LR step", "mean step"
-_LAST_LINES = 3  # of what a failed worker wrote
+_LAST_LINES = 3  # of a failed worker's output that the error shows
 
 
 def measure(
@@ -45,21 +45,21 @@ def measure(
     """Time rendering and training steps in both installations, in turn.
 
     Args:
-        python: The Python executable in whose environment the other xrgs is installed.
-        scene: What is rendered forward and backward.
+        python: The Python executable of the environment with the other xrgs.
+        scene: The load to render forward and backward.
         step: The HR and the LR view of the training steps.
-        counts: Numbers of threads, the first of them 1.
+        counts: Numbers of threads; the first is 1.
         repeats: Number of timed repetitions of each task in each installation.
 
     Returns:
-        Under `this` and `other`, the folder of the package and its instruction set; under `scene`
-        and `step`, the sizes of the loads; and under `rows` what `summarize` returns.
+        `this` and `other`: folder of the package, and its instruction set; `scene` and `step`:
+        sizes of the loads; `rows`: the result of `summarize`.
 
     Raises:
-        XrgsError: `python` is no executable file, or a worker fails.
+        XrgsError: `python` is not an executable file, or a worker fails.
     """
-    # The path of a virtual environment's Python is a link that must not be resolved, because Python
-    # finds the environment by it.
+    # Not resolved: the Python of a virtual environment is a link, and finds the environment by its
+    # own path.
     other = str(Path(python).absolute())
     if not (Path(other).is_file() and os.access(other, os.X_OK)):
         raise XrgsError(f"--against {python}: must be the Python executable of an environment")
@@ -76,25 +76,25 @@ def measure(
         setup = {"scene": files[RENDER], "views": {key: files[key] for key in (HR_STEP, LR_STEP)}}
         for worker in workers.values():
             worker.send(setup)
-        found: dict[str, Any] = {side: worker.answer() for side, worker in workers.items()}
+        answers: dict[str, Any] = {side: worker.answer() for side, worker in workers.items()}
         durations = _take_turns(workers, [*files], counts, repeats)
     sizes = {"scene": scene.sizes, "step": step[0].sizes}
-    return found | sizes | {"rows": summarize(durations, counts)}
+    return answers | sizes | {"rows": summarize(durations, counts)}
 
 
 class _Worker:
-    """The process of one installation, which a `with` block ends."""
+    """The process of an installation; leaving the `with` block ends it."""
 
     def __init__(self, python: str, log: Path) -> None:
         self.python, self.log = python, log
         environment = dict(os.environ)
         if python != sys.executable:
-            environment.pop("PYTHONPATH", None)  # it may name this package
+            environment.pop("PYTHONPATH", None)  # may contain this installation
         environment.setdefault("OMP_WAIT_POLICY", "passive")  # as in training
         try:
             with log.open("wb") as stderr:
                 self.process = subprocess.Popen(  # noqa: S603
-                    # -P: the current folder may hold another checkout.
+                    # -P: does not import a checkout in the current folder.
                     [python, "-P", "-m", "xrgs.bench.against_worker"],
                     cwd=log.parent,
                     env=environment,
@@ -113,14 +113,14 @@ class _Worker:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self.process.kill()  # it has nothing to lose
+        self.process.kill()  # it has no data to save
         self.process.wait()
         self.answers.close()
-        with suppress(BrokenPipeError):  # of a request that it never read
+        with suppress(BrokenPipeError):  # from an unread request
             self.requests.close()
 
     def send(self, request: Mapping[str, Any]) -> None:
-        """Write a request."""
+        """Send a request."""
         try:
             self.requests.write(json.dumps(request) + "\n")
             self.requests.flush()
@@ -128,7 +128,7 @@ class _Worker:
             raise self._failure() from None
 
     def answer(self) -> dict[str, Any]:
-        """Read the answer to the oldest request without one."""
+        """Read the answer to the oldest unanswered request."""
         line = self.answers.readline()
         if not line:
             raise self._failure()
@@ -141,14 +141,14 @@ class _Worker:
     def _failure(self) -> XrgsError:
         self.process.wait()
         lines = self.log.read_text("utf-8", errors="replace").strip().splitlines()
-        said = " | ".join(lines[-_LAST_LINES:]) or f"ended with {self.process.returncode}"
-        return XrgsError(f"against: {self.python} cannot run the benchmark: {said}")
+        output = " | ".join(lines[-_LAST_LINES:]) or f"ended with {self.process.returncode}"
+        return XrgsError(f"against: {self.python} cannot run the benchmark: {output}")
 
 
 def _take_turns(
     workers: Mapping[str, _Worker], tasks: Sequence[str], counts: Sequence[int], repeats: int
 ) -> Durations:
-    """Run each task in each worker once to warm up, then all of them in turn."""
+    """Run each task in each worker once to warm up, then time the tasks in turn."""
     cases = [(task, count) for task in tasks for count in counts]
     durations: dict[tuple[str, str, int], list[float]] = {
         (side, *case): [] for side in SIDES for case in cases
@@ -167,14 +167,16 @@ def summarize(durations: Durations, counts: Sequence[int]) -> list[Row]:
     """Compare the two installations, repetition by repetition.
 
     Args:
-        durations: Milliseconds of each repetition, by side (`SIDES`), task and number of threads.
-        counts: Numbers of threads, ascending, the first of them 1.
+        durations: (side, one of `SIDES`; task; number of threads) -> time of each repetition, ms.
+        counts: Numbers of threads, ascending; the first is 1.
 
     Returns:
-        A row for each task, the mean step included, and number of threads: the medians `this_ms`
-        and `other_ms`; the median `times_faster` of the other's time over this one's, with its
-        quartiles `times_faster_low` and `times_faster_high`; and the median speed-ups over one
-        thread, `this_speedup` and `other_speedup`.
+        A row for each task (including the mean step) and number of threads, with the columns
+
+        - `this_ms`, `other_ms`: median times;
+        - `times_faster`: median ratio of the other's time over this one's, with the quartiles
+          `times_faster_low` and `times_faster_high`;
+        - `this_speedup`, `other_speedup`: median speed-ups over one thread.
     """
     durations = dict(durations)
     for side in SIDES:

@@ -1,14 +1,14 @@
-"""The process that measures its own installation for `xrgs.bench.against` of any version.
+"""The process that runs the tasks of `xrgs.bench.against` in its own installation of xrgs.
 
-The module's name, the requests and the work of each task stay the same from version to version,
-because each installation runs its own:
+Different versions must work together, so the module's name, the requests and the work of each task
+never change. Requests and answers are lines of JSON on standard input and output:
 
-- {"scene": FILE, "views": {NAME: FILE}}, .npz files of `xrgs.bench.loads.write`, is answered by
+- {"scene": FILE, "views": {NAME: FILE}}, with .npz files of `xrgs.bench.loads.write`. Answer:
   {"package": FOLDER, "isa": INSTRUCTION_SET}.
-- {"task": "render" or NAME, "threads": COUNT} renders the scene forward and backward, or takes a
-  training step on a view, and is answered by {"ms": DURATION}.
+- {"task": "render" or NAME, "threads": COUNT}, to render the scene forward and backward, or take a
+  training step on a view. Answer: {"ms": DURATION}.
 
-A request or an answer is a line of JSON. The process ends with its input.
+The process exits at the end of its input.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Fits how the time of a render grows with the number of Gaussians and of pixels."""
+"""Fits the growth of rendering time with the number of Gaussians and the number of pixels."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ def fit_growth(rows: Sequence[Row]) -> list[Row]:
     """Fit power laws to the times of the first method on one thread.
 
     Args:
-        rows: The rows of `rendering.time_load` of loads with several sizes.
+        rows: The rows of `rendering.time_load` for loads of several sizes.
 
     Returns:
-        A row for what grows (`grows`: "Gaussians" or "pixels") at each size of the other (`at`):
-        `sizes` in ascending order, `ms` forward and backward, and the `exponent` of the power law,
-        which is 1 where twice as many take twice as long. The last two rows have the exponents of
-        a fit to all loads. Sizes that do not vary have no rows.
+        A row for each growing quantity (`grows`: "Gaussians" or "pixels") and each size of the
+        other quantity (`at`), with `sizes` in ascending order, `ms` (forward plus backward), and
+        the `exponent` of the power law: 1 if doubling the size doubles the time. The last two rows
+        are for a fit to all loads. Quantities that do not vary have no rows.
     """
     frame = pd.DataFrame(rows)
     frame = frame[(frame["method"] == rows[0]["method"]) & (frame["threads"] == 1)]
@@ -36,16 +36,16 @@ def fit_growth(rows: Sequence[Row]) -> list[Row]:
             "ms": frame["forward_ms"] + frame["backward_ms"],
         }
     )
-    found: list[Row] = []
+    fits: list[Row] = []
     for grows, fixed, name in (("Gaussians", "pixels", "size"), ("pixels", "Gaussians", "count")):
         for _, group in frame.sort_values(grows).groupby(fixed):
             if len(group) > 1:
                 fit = linregress(np.log(group[grows]), np.log(group["ms"]))
                 row = {"grows": grows, "at": group[name].iloc[0], "sizes": group[grows].tolist()}
-                found.append(row | {"ms": group["ms"].tolist(), "exponent": float(fit.slope)})
-    if len({row["grows"] for row in found}) == 2:
+                fits.append(row | {"ms": group["ms"].tolist(), "exponent": float(fit.slope)})
+    if len({row["grows"] for row in fits}) == 2:
         columns = [np.ones(len(frame)), np.log(frame["Gaussians"]), np.log(frame["pixels"])]
         _, *slopes = np.linalg.lstsq(np.stack(columns, axis=1), np.log(frame["ms"]), rcond=None)[0]
         for grows, slope in zip(("Gaussians", "pixels"), slopes, strict=True):
-            found.append({"grows": grows, "at": ALL_LOADS, "exponent": float(slope)})
-    return found
+            fits.append({"grows": grows, "at": ALL_LOADS, "exponent": float(slope)})
+    return fits

@@ -1,4 +1,4 @@
-"""Makes the loads of the benchmark: Gaussians and a view, random, from a file or from a cell."""
+"""Makes the loads of the benchmark: random Gaussians and a view, or those of a file or a cell."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 #: Standard deviation of a random Gaussian over the mean distance between Gaussians in the image.
-#: About 40 Gaussians then contribute to a pixel, whatever their number and the image's size.
+#: With this value, about 40 Gaussians contribute to a pixel, for any number and image size.
 _SIZE_PER_SPACING = 1.5
 _DEPTH_RANGE = (2.0, 6.0)  # world units
-_COVERED_AREA = 1.15  # of half the image's sides; about a tenth of the Gaussians are out of view
+_COVERED_AREA = 1.15  # sides over the image's; about a tenth of the Gaussians are out of view
 _TENSORS = {
     "means": ("N", 3),
     "quats": ("N", 4),
@@ -34,13 +34,13 @@ _TENSORS = {
     "viewmat": (4, 4),
     "K": (3, 3),
 }
-#: The arrays of a load's .npz file and their shapes, for N Gaussians.
+#: Array of a load's .npz file -> its shape, for N Gaussians.
 SHAPES: dict[str, tuple[int | str, ...]] = {**_TENSORS, "width": (), "height": ()}
 
 
 @dataclass(frozen=True)
 class Load:
-    """Gaussians with activated float32 parameters, and the view that they are rendered into."""
+    """Gaussians with activated float32 parameters, and a view to render."""
 
     name: str
     means: Tensor  # [N, 3] world units
@@ -61,7 +61,7 @@ class Load:
 
     @property
     def sizes(self) -> dict[str, str | int]:
-        """The columns of a result that describe this load."""
+        """Columns of a result that describe the load."""
         width, height = self.camera.width, self.camera.height
         return {"load": self.name, "gaussians": len(self), "width": width, "height": height}
 
@@ -69,8 +69,8 @@ class Load:
         """Return the same view at a lower resolution.
 
         Args:
-            factor: Divisor of width and height, which are rounded down, to at least the 11 px of
-                the window of SSIM.
+            factor: Divisor of width and height, which are rounded down, but at least 11 px, the
+                side of the SSIM window.
         """
         camera = self.camera
         width, height = (max(WINDOW, side // factor) for side in (camera.width, camera.height))
@@ -79,7 +79,7 @@ class Load:
         return replace(self, camera=replace(camera, K=K, width=width, height=height))
 
     def center_crop(self, width: int, height: int) -> Load:
-        """Return the middle of the view as a view of its own, at most as large as the view."""
+        """Crop the view around its centre, to at most the given size, px."""
         camera = self.camera
         width, height = min(width, camera.width), min(height, camera.height)
         K = camera.K.clone()
@@ -132,7 +132,7 @@ def read(path: Path) -> Load:
 
     Args:
         path: File with the arrays of `SHAPES`: `scales` in world units, `opacities` in 0..1,
-            `viewmat` from world to camera, the others as in `Load` and `Camera`.
+            `viewmat` from world to camera, and the other arrays as in `Load` and `Camera`.
 
     Raises:
         XrgsError: The file cannot be read, or an array is missing, of the wrong shape, not finite

@@ -1,4 +1,4 @@
-"""Draws the results of the benchmark: a panel for each question."""
+"""Plots the results of the benchmark, with a panel for each question."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from xrgs.photos.images import SOFTWARE
 _DPI = 150
 _SIZE = (4.6, 4.2)  # of a panel, inches
 _MIN_ERROR = 1e-9  # an error of 0 has no logarithm
-_ROOM = 0.6  # beside bars, for the legend, as a share of the longest bar
+_ROOM = 0.6  # beside bars for the legend, as a fraction of the longest bar
 _TIME = "forward + backward, ms"
 
 
 def draw(results: Mapping[str, Any]) -> bytes:
-    """Draw a panel for each question that the results of `xrgs.bench.run` answer.
+    """Draw the plot of the results of `xrgs.bench.run`, with a panel for each question.
 
     Returns:
         The bytes of a PNG.
@@ -40,12 +40,12 @@ def draw(results: Mapping[str, Any]) -> bytes:
 
 
 def draw_figure(results: Mapping[str, Any]) -> Figure:
-    """Make the figure of `draw`. All panels but the one of training steps show one thread."""
+    """Make the figure of `draw`. All panels except that of training steps are for one thread."""
     rows = [row for row in results["rows"] if row["threads"] == 1]
     load = largest_common_load(rows)
-    usual = rows[0]["method"]
+    first_method = rows[0]["method"]
     plain = [row for row in load if row["method"] in {row["backend"], TORCH_FLOAT64}]
-    cutoffs = [row for row in load if f"{row['method']},".startswith(f"{usual},")]
+    cutoffs = [row for row in load if f"{row['method']},".startswith(f"{first_method},")]
     panels: list[Callable[[Axes], None]] = [
         partial(_draw_errors, rows=plain, title="Which backend?", yscale="log"),
         partial(_draw_errors, rows=cutoffs, title="What do cutoffs cost?", yscale="linear"),
@@ -58,7 +58,7 @@ def draw_figure(results: Mapping[str, Any]) -> Figure:
         ]
     panels.append(partial(_draw_steps, rows=results["steps"]))
     columns = len(panels) // 2
-    with style.context("default"):  # whatever the user's own style is
+    with style.context("default"):  # independent of the user's style
         figure = Figure(figsize=(_SIZE[0] * columns, _SIZE[1] * 2), layout="constrained")
         FigureCanvasAgg(figure)
         for number, panel in enumerate(panels, start=1):
@@ -67,7 +67,7 @@ def draw_figure(results: Mapping[str, Any]) -> Figure:
 
 
 def largest_common_load(rows: Sequence[Row]) -> list[Row]:
-    """Return the rows of the load that most methods were timed on; of several, the largest."""
+    """Return the rows of the largest load among those with times of the most methods."""
     groups: dict[tuple[int, int, int], list[Row]] = {}
     for row in rows:
         groups.setdefault((row["gaussians"], row["width"], row["height"]), []).append(row)
@@ -116,7 +116,7 @@ def _draw_growth(axes: Axes, rows: Sequence[Row], grows: str) -> None:
             continue
         label = f"{row['at']}: exponent {row['exponent']:.2f}"
         if row["at"] == ALL_LOADS:
-            axes.plot([], [], " ", label=label)  # an entry of the legend alone
+            axes.plot([], [], " ", label=label)  # only an entry of the legend
         else:
             axes.plot(row["sizes"], row["ms"], "o-", label=label)
     axes.set(xscale="log", yscale="log", title=f"How does time grow with {grows}?")

@@ -1,4 +1,4 @@
-"""Measures rendering forward and backward: time, work, memory and error, with and without skips."""
+"""Measures rendering forward and backward: time, work, memory, error, and the effect of culling."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from xrgs.splat.rendering import Render, rasterize_parameters
 from xrgs.splat.settings import CullingOptions, RasterSettings
 from xrgs.splat.sh import bases
 
-#: Width and height, px, of the part of a view that is compared to a render in float64. All of a
+#: Width and height of the part of a view that is compared with a render in float64, px. A whole
 #: large view would take minutes in float64.
 ERROR_CROP = (96, 72)
-#: The torch backend is timed on loads of at most this size only, because it is slow.
+#: Limits of a load for timing the torch backend, which is slow: Gaussians, pixels, repeats.
 _TORCH_GAUSSIANS, _TORCH_PIXELS, _TORCH_REPEATS = 100_000, 504 * 378, 2
 #: The stages of the native backend, forward and backward.
 STAGES = (
@@ -31,37 +31,37 @@ STAGES = (
     "composite_backward",
     "project_backward",
 )
-#: Name of the method that is the reference of all errors.
+#: Name of the reference method for all errors.
 TORCH_FLOAT64 = "torch float64"
 INACTIVE_BANDS = "inactive SH bands"
 
 
 @dataclass(frozen=True)
 class RenderMethod:
-    """A backend with raster settings, which may trade error for time."""
+    """A backend with raster settings, some of which trade accuracy for time."""
 
     name: str
     backend: str
     settings: RasterSettings = field(default_factory=RasterSettings)
     sh_degree: int = 3
     culling: CullingOptions | None = None
-    """What the native backend culls; None means everything that it can."""
+    """Culling of the native backend; None means all kinds."""
     dtype: torch.dtype = torch.float32
 
 
 def default_methods(backends: Sequence[str]) -> list[RenderMethod]:
-    """Return each backend at gsplat's settings, torch in float64, and three other cutoffs.
+    """Return each backend with gsplat's settings, torch in float64, and three other cut-offs.
 
     Args:
-        backends: Names of the backends; the first is measured with the other cutoffs.
+        backends: Names of the backends; only the first is measured with the other cut-offs.
     """
-    first, usual = backends[0], RasterSettings()
+    first, defaults = backends[0], RasterSettings()
     return [
         *(RenderMethod(name, name) for name in backends),
         RenderMethod(TORCH_FLOAT64, "torch", dtype=torch.float64),
-        RenderMethod(f"{first}, alpha cut 4/255", first, replace(usual, alpha_min=4 / 255)),
-        RenderMethod(f"{first}, alpha cut 1/1020", first, replace(usual, alpha_min=1 / 1020)),
-        RenderMethod(f"{first}, stop at 1e-2", first, replace(usual, transmittance_min=1e-2)),
+        RenderMethod(f"{first}, alpha cut 4/255", first, replace(defaults, alpha_min=4 / 255)),
+        RenderMethod(f"{first}, alpha cut 1/1020", first, replace(defaults, alpha_min=1 / 1020)),
+        RenderMethod(f"{first}, stop at 1e-2", first, replace(defaults, transmittance_min=1e-2)),
     ]
 
 
@@ -70,10 +70,10 @@ class RenderTask:
 
     Attributes:
         image: The last image, [H, W, 3], after a call of `backward`.
-        work: Counts of the last render: `visible` Gaussians, `evaluations` of alpha and, with the
-            native backend, (tile, Gaussian) `pairs`.
-        buffer_bytes: Size of the buffers of the last render.
-        stages: The shortest time of each stage in ms, native backend only.
+        work: Counts of the last render: `visible` Gaussians, alpha `evaluations`, and on the native
+            backend (tile, Gaussian) `pairs`.
+        buffer_bytes: Size of the buffers of the last render, bytes.
+        stages: Stage -> its shortest time, ms; only on the native backend.
     """
 
     def __init__(self, load: Load, method: RenderMethod, count: int) -> None:
@@ -90,7 +90,7 @@ class RenderTask:
         self.stages: dict[str, float] = {}
 
     def forward(self) -> None:
-        """Render the load and keep the graph for one call of `backward`."""
+        """Render the load, and keep the autograd graph for `backward`."""
         view, degree = (self.camera, self.method.settings), self.method.sh_degree
         with use_threads(self.threads):
             if self.method.culling is None:
@@ -104,7 +104,7 @@ class RenderTask:
                 self.render = native.render_culled(self.leaves, *view, degree, None, culling)
 
     def backward(self) -> tuple[Tensor, ...]:
-        """Return the gradients of the six parameters for the last render, and free its graph."""
+        """Return the gradients of the six parameters for the last render, and free the graph."""
         render, self.render = self.render, None
         assert render is not None, "forward() must be called first"  # noqa: S101
         graph: Any = render.image.grad_fn
@@ -131,20 +131,20 @@ def time_load(
 ) -> list[Row]:
     """Time all methods on a load with each number of threads, and compute their errors.
 
-    The torch backend is left out where the load is too large for it. Elsewhere it runs at most
-    twice, and its rows have `times_slower`, its time over the first native method's.
+    For large loads the torch backend is left out. For others it is timed at most twice, and its
+    rows have `times_slower`, its time over that of the first native method.
 
     Returns:
-        The rows of `time_methods`, with the errors of `errors`.
+        The rows of `time_methods`, with the columns of `errors` added.
     """
     fast = [method for method in methods if method.backend != "torch"]
     slow = [method for method in methods if method.backend == "torch"]
     rows = time_methods(load, fast, counts, repeats)
     if len(load) <= _TORCH_GAUSSIANS and load.camera.width * load.camera.height <= _TORCH_PIXELS:
-        usual = {row["threads"]: total_ms(row) for row in reversed(rows)}  # of the first method
+        native_ms = {row["threads"]: total_ms(row) for row in reversed(rows)}  # the first method's
         for row in time_methods(load, slow, counts, min(repeats, _TORCH_REPEATS)):
             if fast:
-                row["times_slower"] = total_ms(row) / usual[row["threads"]]
+                row["times_slower"] = total_ms(row) / native_ms[row["threads"]]
             rows.append(row)
     error = errors(load, methods)
     return [row | error[row["method"]] for row in rows]
@@ -153,11 +153,11 @@ def time_load(
 def time_methods(
     load: Load, methods: Sequence[RenderMethod], counts: Sequence[int], repeats: int
 ) -> list[Row]:
-    """Time each method with each number of threads, all in turn.
+    """Time each method with each number of threads, in turn.
 
     Returns:
-        A row for each method and number of threads: sizes, the shortest and the median times in
-        ms, the speed-up over the first number of threads, work, and memory in MiB.
+        A row for each method and number of threads: sizes, shortest and median times (ms), speed-up
+        over the first number of threads, work, and memory (MiB).
     """
     tasks = {(m.name, count): RenderTask(load, m, count) for m in methods for count in counts}
     passes: dict[tuple[str, int, str], Callable[[], object]] = {}
@@ -185,41 +185,40 @@ def time_methods(
             # Parameters and their gradients, and the buffers.
             "memory_mib": (2 * parameter_bytes + task.buffer_bytes) / 2**20,
         }
-        one = next((other for other in rows if other["method"] == row["method"]), row)
-        rows.append(row | {"speedup": total_ms(one) / total_ms(row)})
+        first_row = next((other for other in rows if other["method"] == row["method"]), row)
+        rows.append(row | {"speedup": total_ms(first_row) / total_ms(row)})
     return rows
 
 
 def total_ms(row: Row) -> float:
-    """Return the time of a render forward and backward, in ms."""
+    """Return the time of a render, forward plus backward, ms."""
     return float(row["forward_ms"] + row["backward_ms"])
 
 
 def errors(load: Load, methods: Sequence[RenderMethod]) -> dict[str, dict[str, float]]:
-    """Compare each method to the torch backend in float64 at gsplat's settings.
+    """Compare each method with the torch backend in float64 at gsplat's settings.
 
-    Only the middle of the view (`ERROR_CROP`) is rendered, as a view of its own.
-
-    All methods must have one `sh_degree`.
+    Only the centre of the view (`ERROR_CROP`) is rendered. All methods must have the same
+    `sh_degree`.
 
     Returns:
-        For each method's name, `image_mean_error` and `image_max_error`, the absolute error of the
-        image, and `gradient_error`, the norm of the gradient's error over the gradient's norm, for
-        the parameter of the six where it is largest.
+        Name of a method -> `image_mean_error` and `image_max_error`, absolute errors of the image,
+        and `gradient_error`, the norm of a gradient's error over the norm of the gradient: the
+        largest of the six parameters.
     """
     crop, threads = load.center_crop(*ERROR_CROP), torch.get_num_threads()
     exact = RenderMethod("exact", "torch", sh_degree=methods[0].sh_degree, dtype=torch.float64)
     exact_image, *exact_gradients = RenderTask(crop, exact, threads).results()
-    found = {}
+    method_errors = {}
     for method in methods:
         image, *gradients = RenderTask(crop, method, threads).results()
         difference = (image.double() - exact_image).abs()
-        found[method.name] = {
+        method_errors[method.name] = {
             "image_mean_error": difference.mean().item(),
             "image_max_error": difference.max().item(),
             "gradient_error": max(map(_relative_error, gradients, exact_gradients)),
         }
-    return found
+    return method_errors
 
 
 def _relative_error(value: Tensor, exact: Tensor) -> float:
@@ -230,57 +229,58 @@ def _relative_error(value: Tensor, exact: Tensor) -> float:
 def time_shortcuts(load: Load, backend: str, repeats: int) -> list[Row]:
     """Time rendering on one thread with each shortcut on and off, in turn.
 
-    A shortcut leaves out work that does not change the result. The kinds of culling
-    (`CullingOptions`) are shortcuts of the native backend. Both backends leave out the bands of the
-    spherical harmonics above the degree that training has reached.
+    A shortcut skips work that does not change the result. The kinds of culling (`CullingOptions`)
+    are shortcuts of the native backend. Both backends skip the bands of the spherical harmonics
+    above the degree that training has reached.
 
     Returns:
-        A row for each shortcut: `shortcut`, sizes, `times` (off over on), `same_bits` (whether
-        image and gradients are equal with and without it) and, with the prefixes `on_` and `off_`,
-        times in ms, alpha evaluations and errors.
+        A row for each shortcut: `shortcut`, sizes, `times` (time off over time on), `same_bits`
+        (whether image and gradients are equal on and off) and, with the prefixes `on_` and `off_`,
+        times (ms), alpha evaluations and errors.
     """
-    usual = RenderMethod("on", backend)
+    all_on = RenderMethod("on", backend)
     rows = []
     if backend == "native":
-        without = [
+        one_off = [
             replace(
-                usual,
+                all_on,
                 name=option.name.replace("_", " "),
                 culling=replace(CullingOptions(), **{option.name: False}),
             )
             for option in fields(CullingOptions)
         ]
-        rows += _compare_shortcuts(load, usual, without, repeats)
-    # Early in training only band 0 is on. Without the shortcut all bands are evaluated, as zeros.
+        rows += _compare_shortcuts(load, all_on, one_off, repeats)
+    # Early in training only band 0 is on. Without the shortcut, the other bands, all zeros, are
+    # evaluated too.
     sh = torch.cat([load.sh[:, :1], torch.zeros_like(load.sh[:, 1:])], dim=1)
-    without = [replace(usual, name=INACTIVE_BANDS)]
-    usual = replace(usual, sh_degree=0)
-    return rows + _compare_shortcuts(replace(load, sh=sh), usual, without, repeats)
+    one_off = [replace(all_on, name=INACTIVE_BANDS)]
+    all_on = replace(all_on, sh_degree=0)
+    return rows + _compare_shortcuts(replace(load, sh=sh), all_on, one_off, repeats)
 
 
 def _compare_shortcuts(
-    load: Load, usual: RenderMethod, without: Sequence[RenderMethod], repeats: int
+    load: Load, all_on: RenderMethod, one_off: Sequence[RenderMethod], repeats: int
 ) -> list[Row]:
-    methods = [usual, *without]
+    methods = [all_on, *one_off]
     timed = {row["method"]: row for row in time_methods(load, methods, [1], repeats)}
     error = errors(load, methods)
     sides = {
         name: {key: row[key] for key in ("forward_ms", "backward_ms", "evaluations")} | error[name]
         for name, row in timed.items()
     }
-    active = bases(usual.sh_degree) - 1  # bases of shN whose gradients are compared
-    *expected, expected_harmonics = RenderTask(load, usual, 1).results()
+    active = bases(all_on.sh_degree) - 1  # bases of shN whose gradients are compared
+    *expected, expected_harmonics = RenderTask(load, all_on, 1).results()
     rows = []
-    for method in without:
-        *found, harmonics = RenderTask(load, method, 1).results()
-        same = all(map(torch.equal, found, expected))
+    for method in one_off:
+        *gradients, harmonics = RenderTask(load, method, 1).results()
+        same = all(map(torch.equal, gradients, expected))
         same &= torch.equal(harmonics[:, :active], expected_harmonics[:, :active])
-        on, off = sides[usual.name], sides[method.name]
+        on, off = sides[all_on.name], sides[method.name]
         rows.append(
             {
                 "shortcut": method.name,
                 **load.sizes,
-                "backend": usual.backend,
+                "backend": all_on.backend,
                 "threads": 1,
                 **{f"on_{key}": value for key, value in on.items()},
                 **{f"off_{key}": value for key, value in off.items()},

@@ -1,4 +1,4 @@
-"""Runs the benchmark and writes its results: text, two .csv files, a plot and a .json file."""
+"""Runs the benchmark, and writes the results: text, two .csv files, a plot and a .json file."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ class BenchmarkSizes(NamedTuple):
     """The sizes of the random loads: numbers of Gaussians, and widths and heights in px."""
 
     gaussians: tuple[int, ...]
-    """Each number is rendered at each of the image sizes."""
+    """Numbers of Gaussians; each is rendered at each of the image sizes."""
     images: tuple[tuple[int, int], ...]
     step: tuple[int, int, int]
-    """The load of the training step and of the shortcuts."""
+    """Load of the training step and of the shortcuts."""
     memory: tuple[int, int, int]
-    """The load of the training step whose memory is measured."""
+    """Load of the training step for the measurement of memory."""
     scene: tuple[int, int, int]
-    """The load that `against` renders."""
+    """Load that `against` renders."""
 
 
 FULL = BenchmarkSizes(
@@ -53,14 +53,14 @@ SMOKE = BenchmarkSizes(
     memory=(300, 80, 60),
     scene=(300, 80, 60),
 )
-#: Of the random scene of `against`: 56 Gaussians contribute to a pixel, as in a trained scene of
-#: llff/fern with as many Gaussians and pixels.
+#: `size_per_spacing` of the random scene of `against`: 56 Gaussians contribute to a pixel, as in a
+#: trained scene of llff/fern with the same numbers of Gaussians and pixels.
 SCENE_SIZE_PER_SPACING = 1.88
 _LR_FACTOR = 5
 
 
 def run(settings: Settings) -> str:
-    """Run the benchmark, or what `save` or `against` asks for.
+    """Run the benchmark, or instead `save` or `against`, if set.
 
     Args:
         settings: The arguments of `xrgs-bench`.
@@ -117,7 +117,7 @@ def _compare(
 def _measure(
     load: Load | None, sizes: BenchmarkSizes, counts: Sequence[int], settings: Settings
 ) -> dict[str, Any]:
-    """Return the results by name: rows by column, or a row."""
+    """Return name -> result: a list of rows, or a single row."""
     backends = ["native", "torch"] if resolve_backend("auto") == "native" else ["torch"]
     backend, repeats = backends[0], settings.repeats
     if load is None:

@@ -1,4 +1,4 @@
-"""The arguments of `xrgs-bench`. This module needs no torch, so that `--help` answers at once."""
+"""The arguments of `xrgs-bench`, in a module without torch, so that `--help` is quick."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 @dataclass
 class Settings:
-    """What to measure, and where to write the results."""
+    """The measurements and the output files."""
 
     load: str | None = None
     """Measure the Gaussians and the view in this .npz file instead of random ones (see `save`)."""
     save: str | None = None
-    """Write a .npz file with the Gaussians of `cell` and one view of it, and measure nothing."""
+    """Only write a .npz file with the Gaussians and a view of `cell`, without a benchmark."""
     cell: str | None = None
     """Folder of a trained cell in its store, for `save`."""
     view: str | None = None
@@ -22,12 +22,12 @@ class Settings:
     json: str | None = None
     """Also write all results to this JSON file."""
     repeats: int = 9
-    """How often each task is timed; tasks that are compared take turns."""
+    """Number of timed runs of each task; tasks that are compared take turns."""
     threads: int = 0
     """Number of threads to measure besides 1; 0 means one for each core."""
     smoke: bool = False
     """Use tiny loads, to check that everything runs."""
     against: str | None = None
-    """Time this installation and another in turn; the Python executable of the other."""
+    """Python executable of another installation, to time both in turn."""
     seed: int = 0
     """Seed of the random loads."""

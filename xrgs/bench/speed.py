@@ -1,4 +1,4 @@
-"""Measures how quickly this machine trains, in seconds: enough to say how long a training takes."""
+"""Measures the training speed of this machine within seconds, to predict the time of a training."""
 
 from __future__ import annotations
 
@@ -20,32 +20,34 @@ if TYPE_CHECKING:
 
     from xrgs.config import Conf
 
-#: The view of the load, px, and its Gaussians: half a Gaussian for each pixel, as after training.
+#: Size of the load's view, px, and number of Gaussians: half a Gaussian per pixel, as after
+#: training.
 _SIZE, _GAUSSIANS = (252, 189), 24_000
-#: Seconds that are measured, and the fewest steps.
+#: Time of the measurement, seconds, and least number of steps.
 _SECONDS, _LEAST_STEPS = 2.0, 3
-#: Steps of a trial. All schedules shrink to it, so that as many Gaussians grow as in a long run.
+#: Steps of a trial. All schedules are scaled to it, so that Gaussians grow as in a long run.
 _TRIAL = 200
-#: Densification takes this share of the other parts of a step in a run of some thousand steps (our
-#: choice; 0.13 on monstree, 7,500 steps). In a trial it takes more, since it refines as often.
+#: Time of densification over that of the other parts of a step, in a run of several thousand steps
+#: (our choice; 0.13 on monstree, 7,500 steps). The ratio in a trial is higher and not used, since a
+#: trial has the same number of refinements in fewer steps.
 _DENSIFICATION = 0.15
 
 
 @dataclass(frozen=True)
 class Trial:
-    """How long a training takes."""
+    """The measured times of a training."""
 
     start_s: float
-    """Seconds before the first step: those of a dense start."""
+    """Time before the first step, of a dense start, seconds."""
     step_s: float
-    """Seconds of a step."""
+    """Time of a step, seconds."""
 
 
 def trial(conf: Conf, folder: Path) -> Trial:
-    """Train on a variant for 200 steps, which are thrown away, and measure them.
+    """Time 200 training steps on a variant; their result is discarded.
 
     Args:
-        conf: The config of the training whose length is not known yet.
+        conf: The config of the training; its number of steps is ignored.
         folder: The variant's folder.
     """
     set_torch_threads(conf.threads)
@@ -57,9 +59,10 @@ def trial(conf: Conf, folder: Path) -> Trial:
 
 
 def seconds_per_unit(threads: int, backend: str = "auto") -> float:
-    """Measure training steps: seconds a step, for each rendered pixel and each Gaussian.
+    """Measure the time of a training step divided by the number of pixels plus Gaussians, seconds.
 
-    Both count alike, as in `xrgs.sweep.estimate`. The median of a few steps on random Gaussians.
+    `xrgs.sweep.estimate` uses the same unit. The result is the median of a few steps on random
+    Gaussians.
 
     Args:
         threads: Number of threads.
@@ -67,7 +70,7 @@ def seconds_per_unit(threads: int, backend: str = "auto") -> float:
     """
     load = random_load(_GAUSSIANS, *_SIZE, seed=0)
     step = TrainingStep(load, resolve_backend(backend), threads)
-    step.run_step()  # the first one allocates
+    step.run_step()  # the first step allocates memory
     times: list[float] = []
     while sum(times) < _SECONDS or len(times) < _LEAST_STEPS:
         start = time.perf_counter()

@@ -9,7 +9,7 @@ from xrgs.bench.against import HR_SHARE, SIDES
 from xrgs.bench.rendering import STAGES
 from xrgs.bench.timing import Row
 
-# The columns of each table: a format string of a row's values by heading.
+# Columns of each table: heading -> format string for the values of a row.
 _SIZES = {"threads": "{threads}", "Gaussians": "{gaussians}", "size": "{width}x{height}"}
 _RENDERS = {
     "method": "{method}",
@@ -133,8 +133,8 @@ def table(rows: Sequence[Row], columns: Mapping[str, str]) -> str:
 
     Args:
         rows: The rows.
-        columns: For each heading, a format string of a row's values. A cell is empty where the row
-            lacks a value.
+        columns: Heading -> format string for the values of a row. A cell is empty if the row lacks
+            a value.
     """
     lines = [list(columns), *([_cell(form, row) for form in columns.values()] for row in rows)]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]

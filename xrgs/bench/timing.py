@@ -1,4 +1,4 @@
-"""Times tasks in turn, so that a machine with other work still gives true ratios."""
+"""Times tasks in turn, so that their ratios are valid also on a machine with other work."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import torch
 
-Row = dict[str, Any]  # one result: values by column
+Row = dict[str, Any]  # column -> value
 _Key = TypeVar("_Key")
 
 
@@ -19,16 +19,16 @@ def time_interleaved(
     """Run each task once to warm up, then all tasks in turn (A B A B ...).
 
     Args:
-        tasks: The tasks, each under a key.
+        tasks: Key -> task.
         repeats: Number of timed runs of each task.
 
     Returns:
-        For each key, the duration of each run in ms.
+        Key -> duration of each run, ms.
     """
     for task in tasks.values():
         task()
     durations: dict[_Key, list[float]] = {key: [] for key in tasks}
-    # In turn: other work on the machine then slows all tasks down, and their ratios stay true.
+    # In turn, so that other work on the machine slows down all tasks alike.
     for _ in range(repeats):
         for key, task in tasks.items():
             start = time.perf_counter()

@@ -1,4 +1,4 @@
-"""Measures a training step: the time of each part, two shortcuts, and the memory that it takes."""
+"""Measures a training step: the time of each part, two shortcuts, and the memory."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ from xrgs.splat.strategy.default import DefaultStrategy
 
 L1, SSIM = 0.8, 0.2  # weights of the photometric loss
 STEP_PARTS = ("render", "loss", "backward", "optimizer", "densify")
-_MEMORY_STEPS = 3  # the optimizer has no state in the first one
+_MEMORY_STEPS = 3  # in the first step the optimizer has no state yet
 _PROCESS_STATUS = Path("/proc/self/status")
 
 
 class TrainingStep:
     """A training step on a load, which runs as a whole or part by part.
 
-    The target is the load's own render, slightly brighter. The number of Gaussians stays the same:
-    densification gathers its statistics, but its thresholds are out of reach.
+    The target is the load's render, slightly brighter. Densification collects its statistics, but
+    its thresholds are out of reach, so that the number of Gaussians does not change.
     """
 
     def __init__(self, load: Load, backend: str, count: int, *, sh_degree: int = 3) -> None:
@@ -56,7 +56,7 @@ class TrainingStep:
         self.target = prepare_target(self.rendered.image.detach() + 0.01, backend=backend)
 
     def render(self) -> None:
-        """Render; the native backend activates the parameters as it reads them."""
+        """Render; the native backend also applies the activation functions."""
         with use_threads(self.threads):
             self.optimizer.zero_grad()
             self.offset = zero_means2d_offset(len(self.gaussians))
@@ -71,7 +71,7 @@ class TrainingStep:
             )
 
     def loss(self) -> None:
-        """Compute the loss; the native backend computes its gradient as well."""
+        """Compute the loss; the native backend also computes its gradient."""
         with use_threads(self.threads):
             self.value = photometric_loss(
                 self.rendered.image, self.target, l1=L1, ssim=SSIM, backend=self.backend
@@ -88,12 +88,12 @@ class TrainingStep:
             self.optimizer.step(self.camera, sh_degree=self.sh_degree)
 
     def densify(self) -> None:
-        """Run densification as in all steps from one refinement to the next."""
+        """Run densification as in a step without refinement."""
         for step in range(1, self.settings.every + 1):
             self._densify_after(step)
 
     def run_step(self) -> None:
-        """Run one whole step; its densification only gathers statistics."""
+        """Run a whole step, without refinement."""
         for part in (self.render, self.loss, self.backward, self.optimize):
             part()
         self._densify_after(1)
@@ -126,9 +126,9 @@ def time_steps(
     """Time each part of a training step.
 
     Args:
-        views: The load by the name of the view, "HR" or "LR".
+        views: Name of the view, "HR" or "LR" -> load.
         backend: "native" or "torch".
-        counts: Numbers of threads, the first of them 1.
+        counts: Numbers of threads; the first is 1.
         repeats: Number of timed runs.
 
     Returns:
@@ -152,19 +152,19 @@ def time_steps(
         ms["densify"] /= step.settings.every
         row: Row = {"view": view, "backend": backend, "threads": count, **step.load.sizes}
         row |= {f"{part}_ms": value for part, value in ms.items()} | {"step_ms": sum(ms.values())}
-        one = next((other for other in rows if other["view"] == view), row)
-        rows.append(row | {"speedup": one["step_ms"] / row["step_ms"]})
+        first_row = next((other for other in rows if other["view"] == view), row)
+        rows.append(row | {"speedup": first_row["step_ms"] / row["step_ms"]})
     return rows
 
 
 def time_shortcuts(load: Load, backend: str, repeats: int) -> list[Row]:
     """Time the shortcuts of a training step outside the renderer, on one thread.
 
-    Neither of them changes a bit.
+    They do not change a bit of the result.
 
     Returns:
         A row for each shortcut: `shortcut`, the `part` of the step, sizes, `on_ms`, `off_ms` and
-        `times` (off over on).
+        `times` (time off over time on).
     """
     pairs = {
         ("statistics of the photograph, once per view", "loss"): loss_gradients(load, backend),
@@ -182,7 +182,7 @@ def time_shortcuts(load: Load, backend: str, repeats: int) -> list[Row]:
 
 
 def loss_gradients(load: Load, backend: str) -> tuple[Callable[[], Tensor], ...]:
-    """Return functions of the loss's gradient: with a target prepared before, and prepared anew."""
+    """Return two functions for the loss's gradient: with a prepared target, and preparing it."""
     generator = torch.Generator().manual_seed(0)
     shape = (2, load.camera.height, load.camera.width, 3)
     image, photograph = torch.rand(shape, generator=generator)
@@ -193,16 +193,16 @@ def loss_gradients(load: Load, backend: str) -> tuple[Callable[[], Tensor], ...]
         with use_threads(1):
             used = target if prepared else prepare_target(photograph, backend=backend)
             loss = photometric_loss(image, used, l1=L1, ssim=SSIM, backend=backend)
-            found: Tensor = torch.autograd.grad(loss, image)[0]
-            return found
+            v_image: Tensor = torch.autograd.grad(loss, image)[0]
+            return v_image
 
     return partial(gradient, prepared=True), partial(gradient, prepared=False)
 
 
 def steps_of_sh_degrees(load: Load, backend: str) -> tuple[TrainingStep, TrainingStep]:
-    """Return a training step at SH degree 0 and one at degree 3, both ready to optimize.
+    """Return training steps at SH degree 0 and at degree 3, ready for `optimize`.
 
-    At degree 0 all moments of shN are zero, and Adam skips them.
+    At degree 0 all moments of shN are zero, and Adam skips shN.
     """
     before, after = (TrainingStep(load, backend, 1, sh_degree=degree) for degree in (0, 3))
     for step in (before, after):
@@ -216,12 +216,11 @@ def measure_memory(backend: str, gaussians: int, width: int, height: int, thread
 
     Returns:
         A row with the sizes and, in MiB: `counted_mib`, of parameters, gradients, Adam's state and
-        the renderer's buffers; `base_rss_mib`, the resident memory before training;
-        `peak_rss_mib`, its maximum; and `growth_mib`, their difference. A system without /proc has
-        only the first.
+        the renderer's buffers; `base_rss_mib`, resident memory before training; `peak_rss_mib`, its
+        maximum; and `growth_mib`, their difference. Without /proc there is only `counted_mib`.
     """
-    # A process of its own, because this one has held other loads before. -P keeps the current
-    # folder, which may be another checkout, out of the child's sys.path.
+    # A new process, since this one has already allocated memory for other loads. -P: does not
+    # import a checkout in the current folder.
     arguments = [str(value) for value in (backend, gaussians, width, height, threads)]
     command = [sys.executable, "-P", "-m", "xrgs.bench.training", *arguments]
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE)  # noqa: S603
@@ -232,7 +231,7 @@ def measure_memory(backend: str, gaussians: int, width: int, height: int, thread
 def _memory_of_this_process(
     backend: str, gaussians: int, width: int, height: int, threads: int
 ) -> Row:
-    # A tiny step loads what is loaded on first use, so that it belongs to the base.
+    # A tiny step first, so that memory of lazily loaded libraries is part of the base.
     _train(TrainingStep(random_load(50, 16, 16, seed=0), backend, threads))
     base, _ = _resident_mib()
     step = TrainingStep(random_load(gaussians, width, height, seed=0), backend, threads)
@@ -245,15 +244,15 @@ def _memory_of_this_process(
 
 
 def _train(step: TrainingStep) -> int:
-    """Train a few steps; return the bytes counted at the last one."""
+    """Train a few steps; return `counted_bytes` after the last step."""
     for _ in range(_MEMORY_STEPS):
         step.run_step()
     return step.counted_bytes()
 
 
 def _resident_mib() -> tuple[float, float]:
-    """Return this process's resident memory, now and at its maximum; zeros without /proc."""
-    # Not ru_maxrss: in a child it begins at the parent's.
+    """Return this process's resident memory and its maximum, MiB; zeros without /proc."""
+    # Not ru_maxrss, which in a child process starts at the parent's value.
     if not _PROCESS_STATUS.exists():
         return 0.0, 0.0
     lines = dict(line.split(":", 1) for line in _PROCESS_STATUS.read_text("ascii").splitlines())

@@ -1,8 +1,9 @@
-// The floating-point state in which all kernels run.
+// The floating-point state of all kernels: denormal numbers count as zero.
 //
 // Arithmetic on denormal numbers (below 1.2e-38) is tens of times slower on many processors, and a
-// moment of Adam without gradient would stay at the smallest of them for ever. A thread inherits
-// its state from the one that started it, so results would depend on what that one had set.
+// moment of Adam without gradient would remain at the smallest of them forever. A thread inherits
+// the state of the thread that started it, so without a fixed state results would depend on the
+// caller.
 #pragma once
 
 #include <cstdint>
@@ -13,9 +14,9 @@
 
 namespace xrgs {
 
-// While an object lives, its thread rounds to nearest and takes denormal numbers for zeros, as
-// operands and as results. The state before is restored at the end of the scope. On processors
-// other than x86-64 and AArch64 it does nothing.
+// While an object of this class exists, its thread rounds to nearest and treats denormal operands
+// and results as zeros. The destructor restores the previous state. On processors other than x86-64
+// and AArch64 it does nothing.
 class FlushDenormals {
  public:
   FlushDenormals() noexcept : saved_(read()) { write(kFlushing); }

@@ -14,9 +14,9 @@ namespace {
 constexpr const char* kNames[] = {"portable", "avx2", "avx512"};
 
 #ifdef XRGS_X86
-// The instructions that the processor has and that the operating system saves the registers of.
-// They are read from the processor, because __builtin_cpu_supports asks the compiler's runtime
-// library, and that of Zig says no to everything.
+// The instruction sets that the processor has, and whose registers the operating system saves. They
+// are read from the processor, because __builtin_cpu_supports uses the compiler's runtime library,
+// and in Zig's it always returns false.
 struct Processor {
   bool avx2 = false;
   bool avx512 = false;

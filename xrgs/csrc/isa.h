@@ -1,9 +1,9 @@
-// The choice of the instruction set at run time. Every kernel file is compiled once for each of
-// them.
+// The choice of the instruction set at run time. Every kernel file is compiled once for each
+// instruction set.
 //
-// A family of kernels is a struct of function pointers, with one instance in the namespace of each
+// A family of kernels is a struct of function pointers, with an instance in the namespace of each
 // instruction set (`portable`, `avx2`, `avx512`). XRGS_DECLARE_TABLE declares these instances, and
-// XRGS_SELECT is the one of the instruction set in use.
+// XRGS_SELECT is the instance of the instruction set in use.
 #pragma once
 
 #include <string>
@@ -13,17 +13,16 @@ namespace xrgs {
 
 enum class Isa { portable, avx2, avx512 };
 
-// The instruction set in use: the widest that the processor has, or the one that the environment
-// variable XRGS_ISA names. Throws std::invalid_argument where that is no instruction set that this
-// machine has.
+// The instruction set in use: the one in the environment variable XRGS_ISA, else the widest of the
+// processor. Throws std::invalid_argument if this machine does not have the one in XRGS_ISA.
 Isa active_isa();
 
-// Selects another one for the whole process. Throws std::invalid_argument as above.
+// Selects another instruction set for the whole process. Throws std::invalid_argument as above.
 void set_isa(const std::string& name);
 
 const char* isa_name(Isa isa);
 
-// The instruction sets that this machine has, narrowest first.
+// The instruction sets of this machine, narrowest first.
 std::vector<std::string> available_isas();
 
 #ifdef XRGS_X86

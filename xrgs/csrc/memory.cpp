@@ -20,7 +20,7 @@ constexpr std::size_t kLine = 64;
 [[maybe_unused]] constexpr std::size_t kHugePage = std::size_t{2} << 20;
 
 #ifdef XRGS_FAULT_INJECTION
-std::atomic<std::int64_t> allocations_left{0};  // until the one that fails, with it
+std::atomic<std::int64_t> allocations_left{0};  // up to and including the one that fails
 std::atomic<bool> has_failed{false};
 
 bool must_fail() noexcept {
@@ -49,7 +49,7 @@ void* allocate(std::size_t bytes) noexcept {
   if (bytes >= 2 * kHugePage) {
     const std::size_t size = (bytes + kHugePage - 1) / kHugePage * kHugePage;
     void* block = std::aligned_alloc(kHugePage, size);
-    // A failure is no error: the block works without huge pages, only more slowly.
+    // If this fails, the block works without huge pages, only more slowly.
     if (block != nullptr) (void)madvise(block, size, MADV_HUGEPAGE);
     return block;
   }
@@ -73,9 +73,9 @@ void deallocate(void* block) noexcept {
 }  // namespace xrgs
 
 #ifdef XRGS_FAULT_INJECTION
-// The linker is told (--wrap) to call the first of these where the module's code says operator new,
-// which is the second: a module cannot replace operator new for itself alone. _Znwm is the name of
-// operator new(unsigned long).
+// With the linker's option --wrap, calls of operator new in the module go to __wrap__Znwm, and
+// __real__Znwm is the real operator new. A module can't replace operator new only for itself. _Znwm
+// is the mangled name of operator new(unsigned long).
 extern "C" {
 void* __real__Znwm(std::size_t bytes);
 void* __wrap__Znwm(std::size_t bytes);

@@ -1,4 +1,4 @@
-// The Python module xrgs._native. Each family of kernels has its bindings in a file of its own.
+// The Python module xrgs._native. The bindings of each family of kernels are in a separate file.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/string.h>
@@ -46,10 +46,10 @@ xrgs::Output sqrt_upper_bound_array(Vector x) {
 
 NB_MODULE(_native, m) {
   using namespace xrgs;
-  // torch keeps graphs, and frames with them, alive past the end of the interpreter.
+  // torch keeps graphs, and so frames, alive beyond the end of the interpreter: no leak.
   nb::set_leak_warnings(false);
   m.doc() = "The compiled kernels of xrgs.";
-  xrgs::active_isa();  // an XRGS_ISA that is not valid fails here, at the import
+  xrgs::active_isa();  // fails here, at the import, if XRGS_ISA is invalid
   m.def("isa", [] { return isa_name(active_isa()); }, "Return the instruction set in use.");
   m.def("set_isa", &set_isa, nb::arg("name"),
         "Use another instruction set from now on, in the whole process.");

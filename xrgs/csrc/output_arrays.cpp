@@ -1,6 +1,6 @@
-// Blocks that are not in use are kept in one list, the last released first: some tens of blocks,
-// which are searched in well under a microsecond. The blocks are the list's elements, so that a
-// release needs no memory and cannot fail.
+// Unused blocks are kept in a linked list, the last released first: some tens of blocks, whose
+// search takes well under a microsecond. The blocks are the list's elements, so releasing a block
+// needs no memory and can't fail.
 #include "output_arrays.h"
 
 #include <mutex>
@@ -14,8 +14,8 @@ namespace {
 constexpr std::size_t kAlignment = 64;
 
 #ifdef XRGS_FAULT_INJECTION
-// Every block is new, so that its allocation can fail, and has the exact size, so that a sanitizer
-// sees a step past its end.
+// Every block is newly allocated, so that its allocation can fail, and has the exact size, so that
+// a sanitizer detects accesses past the end.
 constexpr std::size_t kMaxUnusedBytes = 0;
 constexpr bool kExactSizes = true;
 #else
@@ -23,8 +23,8 @@ constexpr std::size_t kMaxUnusedBytes = std::size_t{1} << 30;
 constexpr bool kExactSizes = false;
 #endif
 
-// A block that was in none of this many acquisitions is of a size that is no longer wanted: about
-// twenty steps of training, in which views of every size come again.
+// A block unused for this many acquisitions has a size that is no longer needed: they are about
+// twenty steps of training, in which views of every size occur.
 constexpr std::uint64_t kMaxIdleAcquisitions = 256;
 
 struct BlockCache {
@@ -33,14 +33,14 @@ struct BlockCache {
   std::size_t unused_bytes = 0;
   std::uint64_t acquisitions = 0;
 
-  // Takes the block that `link` points to out of the list.
+  // Removes the block that `link` points to from the list.
   Block* take(Block** link) noexcept {
     Block* block = *link;
     *link = block->next;
     unused_bytes -= block->size;
     return block;
   }
-  // Takes a block of exactly `size` bytes, or returns null.
+  // Removes and returns a block of exactly `size` bytes, or returns null.
   Block* take_size(std::size_t size) noexcept {
     Block** link = &unused;
     while (*link != nullptr && (*link)->size != size) link = &(*link)->next;
@@ -55,7 +55,7 @@ BlockCache& block_cache() {
   return *instance;
 }
 
-// Sizes within 1/8 of one another share a class, so that a growing model does not need new blocks.
+// Sizes that differ by less than 1/8 share a class, so that a growing model reuses blocks.
 std::size_t size_class(std::size_t bytes) {
   if (kExactSizes) return (bytes / kAlignment + 1) * kAlignment;
   std::size_t size = 4096;
@@ -76,8 +76,8 @@ Block* new_block(std::size_t size) {
   return block.release();
 }
 
-// Deletes the blocks of sizes that are no longer wanted. Only where a new block is needed does the
-// memory grow, so only then is this called: as long as sizes stay the same, all blocks are kept.
+// Deletes blocks of sizes that are no longer needed. It is called only before allocating a new
+// block: while sizes stay the same, memory does not grow, and all blocks are kept.
 void delete_idle_blocks(BlockCache& cache) {
   for (Block** link = &cache.unused; *link != nullptr;)
     if (cache.acquisitions - (*link)->last_used > kMaxIdleAcquisitions)

@@ -1,8 +1,8 @@
-// Arrays that are handed to Python, on memory that is used again.
+// Arrays for Python whose memory is reused.
 //
-// Touching new pages takes longer than the kernels that fill them: a new gradient of 18 MB is 4,400
-// page faults. A block is released when the last tensor on it dies, and waits here for the next one
-// of its size.
+// Touching new pages takes longer than filling them by the kernels: a new gradient of 18 MB causes
+// 4,400 page faults. A block is released with the last tensor on it, and kept for the next array of
+// its size.
 #pragma once
 
 #include <nanobind/nanobind.h>
@@ -15,8 +15,7 @@
 
 namespace xrgs {
 
-// Memory on a 64-byte boundary, uninitialised. The members below `data` are those of the list in
-// which the block waits while it is not in use.
+// Uninitialised memory with 64-byte alignment. The other members are for the list of unused blocks.
 struct Block {
   void* data;
   std::size_t size;         // bytes
@@ -34,7 +33,7 @@ using OwnedBlock = std::unique_ptr<Block, ReleaseBlock>;
 // Returns a block of at least `bytes`. Throws std::bad_alloc.
 OwnedBlock acquire_block(std::size_t bytes);
 
-// The bytes of all blocks that are not in use.
+// Size of all unused blocks, bytes.
 std::size_t unused_bytes();
 
 using Output = nanobind::ndarray<nanobind::pytorch, nanobind::device::cpu, nanobind::c_contig>;
@@ -49,7 +48,7 @@ Output new_array(std::initializer_list<std::size_t> shape) {
   void* data = block->data;
   nanobind::capsule owner(block.get(),
                           [](void* p) noexcept { release_block(static_cast<Block*>(p)); });
-  (void)block.release();  // it is the capsule's from here on
+  (void)block.release();  // the capsule owns it now
   return Output(data, shape, owner, {}, nanobind::dtype<T>());
 }
 

@@ -1,11 +1,11 @@
-// The pool runs one job at a time, whose tasks an atomic counter hands out.
+// The pool runs one job at a time; an atomic counter distributes its tasks.
 //
 // A render is a dozen jobs of a fraction of a millisecond each, and waking a sleeping thread takes
-// a tenth of a millisecond: a thread that waits spins for a moment before it sleeps.
+// a tenth of a millisecond. So a waiting thread spins for a moment before it sleeps.
 //
-// The pool is never destroyed: threads that sleep at exit end with the process. A forked child has
-// none of its parent's threads and starts a new pool, in the same place, so that nothing here needs
-// memory that could be missing.
+// The pool is never destroyed: sleeping threads end with the process. A forked child has none of
+// its parent's threads, and constructs a new pool in the same memory, so that no allocation can
+// fail.
 #include "thread_pool.h"
 
 #include <atomic>
@@ -18,7 +18,7 @@
 
 #include "flush_denormals.h"
 
-#if !defined(_WIN32)  // whose processes do not fork
+#if !defined(_WIN32)  // Windows has no fork
 #include <pthread.h>
 #endif
 
@@ -55,19 +55,18 @@ class ThreadPool {
   }
 
  private:
-  // Starts threads until there are `count`. Only the caller that set busy_ may call this.
+  // Starts threads up to `count`. Only the caller that has set busy_ may call this.
   void start_workers(int count) {
     try {
       for (; started_ < count; ++started_) std::thread([this] { worker_loop(); }).detach();
     } catch (const std::system_error&) {
-      // With fewer threads than requested the job takes longer, but it is done.
+      // The job runs with fewer threads.
     } catch (const std::bad_alloc&) {
-      // The same: there is no memory for another thread.
+      // The same.
     }
   }
 
-  // Spins until `ready`, but no longer than some 50 us, which other work on a busy machine does not
-  // notice.
+  // Spins until `ready`, at most about 50 us, which hardly slows down other work.
   template <class Ready>
   static void spin_wait(Ready ready) {
     const auto end = std::chrono::steady_clock::now() + std::chrono::microseconds(50);
@@ -93,7 +92,7 @@ class ThreadPool {
   }
 
   void worker_loop() {
-    const FlushDenormals flush;  // as run_tasks does for the caller
+    const FlushDenormals flush;  // as run_tasks for the caller
     std::uint64_t last_generation = 0;
     std::unique_lock<std::mutex> lock(mutex_);
     for (;;) {
@@ -129,11 +128,11 @@ alignas(ThreadPool) unsigned char pool_memory[sizeof(ThreadPool)];
 ThreadPool* new_pool() { return new (pool_memory) ThreadPool; }
 
 #if !defined(_WIN32)
-// A forked child has one thread only, so nothing races with this.
+// A forked child has only one thread, so there is no race.
 void replace_pool_in_child() { new_pool(); }
 #endif
 
-// This runs when the module is loaded, before there is a second thread that could use the pool.
+// This runs when the module is loaded, before a second thread could use the pool.
 ThreadPool* const pool = [] {
 #if !defined(_WIN32)
   pthread_atfork(nullptr, nullptr, replace_pool_in_child);

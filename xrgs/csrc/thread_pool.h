@@ -1,9 +1,8 @@
-// A small pool of threads that sleep while there is nothing to do.
+// A small pool of threads that sleep between jobs.
 //
-// This is not OpenMP, because a second OpenMP runtime beside torch's own spins at its barriers,
-// which was 25 times slower on a machine that does other work as well. Tasks are numbered, and any
-// thread may run any of them: a result is the same for every number of threads only if a task
-// depends on its number alone.
+// OpenMP is not used: a second OpenMP runtime besides torch's spins at its barriers, which was 25
+// times slower on a machine with other work. Tasks are numbered, and any thread may run any task,
+// so a task may depend only on its number if the result must not depend on the number of threads.
 #pragma once
 
 #include <cstdint>
@@ -12,11 +11,11 @@ namespace xrgs {
 
 using Task = void (*)(void* context, std::int64_t index);
 
-// Runs the tasks 0..count-1 on up to `threads` threads, one of which is the caller's, and returns
-// when all are done. Tasks must not throw. A call from inside a task, and a call while that of
-// another thread is running, run all of their tasks in the caller. Tasks take denormal numbers for
-// zeros on every thread, whatever its state (flush_denormals.h); that of the caller is restored. It
-// is safe to call this in a forked child and while the interpreter exits.
+// Runs the tasks 0..count-1 on up to `threads` threads, including the caller's, and returns when
+// all are done. Tasks must not throw. A call from a task, or during another thread's call, runs all
+// of its tasks in the calling thread. Tasks treat denormal numbers as zeros on every thread
+// (flush_denormals.h); the caller's state is restored. The function may be called in a forked child
+// and while the interpreter exits.
 void run_tasks(int threads, std::int64_t count, Task task, void* context);
 
 // Runs body(index) for the indices 0..count-1, as run_tasks does.

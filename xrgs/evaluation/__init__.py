@@ -1,1 +1,1 @@
-"""Evaluates trained Gaussians: the frozen protocol and the metrics that cells are compared by."""
+"""Evaluates trained Gaussians: the frozen evaluation protocol and the metrics."""

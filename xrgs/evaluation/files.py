@@ -1,4 +1,4 @@
-"""Scores a render that is a file: another program's, for example."""
+"""Scores a render that is stored in a file, by another program for example."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def score_file(render: Path, view: View, *, masked: bool) -> dict[str, float | N
     Args:
         render: The file, of the view's size.
         view: The view.
-        masked: As for `xrgs.evaluation.metrics.score_view`.
+        masked: Whether any of the scored views has a mask (`xrgs.evaluation.metrics.score_view`).
 
     Raises:
         ImageError: A file is missing, damaged or of another size or mode; the message names it.

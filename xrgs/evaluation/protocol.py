@@ -4,8 +4,8 @@ Each view is rendered with the settings of the training and all SH bands, and cl
 float32 image is scored against the 8-bit photograph / 255 with every metric of
 `xrgs.evaluation.metrics.VIEW_METRICS`, inside the view's mask.
 
-LPIPS needs weights that are not shipped. Only the published ones are accepted, so whether a machine
-has them is not in a cell's identity: a cell scored without them is complete, and has no LPIPS.
+The weights of LPIPS are a separate download. Only the published weights are accepted, so a cell's
+identity does not depend on them: without the weights, a cell is complete but has no LPIPS.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ def score_views(
 ) -> list[dict[str, Any]]:
     """Render and score each view, and write its clamped render as `<view>.png`.
 
-    The renders are not waited for until they are on the disk: `CellFolder.finish` does that.
+    The files are not synced to the disk here; `CellFolder.finish` syncs them.
 
     Args:
         gaussians: The trained model.
         views: The test views, at full size.
-        conf: The model's settings: the rasterizer's, and the backend.
-        renders: The folder for the renders, made where it is missing; its parent must exist.
+        conf: Settings of the model; those of the rasterizer and the backend are read.
+        renders: The folder for the renders, created if missing; its parent must exist.
 
     Returns:
-        One row per view: its name under `view`, and each metric's value under the metric's name,
-        None where the metric is not available.
+        One row for each view: `view`, its name, and a column for each metric, None if the metric is
+        not available.
     """
     from xrgs.photos import images
     from xrgs.runtime.progress import progress
@@ -58,15 +58,15 @@ def score_views(
 def mean_scores(
     gaussians: Gaussians, views: Sequence[LoadedView], conf: SplatConf
 ) -> dict[str, float | None]:
-    """Score each view as `score_views` does, without keeping the renders.
+    """Score each view as `score_views` does, without writing renders.
 
     Args:
         gaussians: The model as it would be saved.
         views: The test views, at full size; at least one.
-        conf: The model's settings: the rasterizer's, and the backend.
+        conf: Settings of the model; those of the rasterizer and the backend are read.
 
     Returns:
-        The mean of each metric over the views; None where it is not available.
+        Metric name -> mean over the views; None if it is not available.
     """
     gaussians, masked = _placed(gaussians, conf), _any_mask(views)
     rows = [_score(gaussians, view, conf, masked=masked)[1] for view in views]
@@ -79,17 +79,16 @@ def mean_scores(
 
 
 def render_time(gaussians: Gaussians, views: Sequence[LoadedView], conf: SplatConf) -> float:
-    """Measure how long a test view takes to render: the "runtime per frame" of the paper.
+    """Measure the time of rendering a test view, the "runtime per frame" of the paper.
 
-    Each view is rendered once to warm up and then timed, on the threads that torch has now. The
-    time is that from the model's parameters to the image, as gsplat's trainer takes it [ye2025],
-    on the GPU where the backend is gsplat; the median over the views is our choice. Nothing is
-    scored or kept.
+    Each view is rendered once to warm up and then timed, with torch's present number of threads, on
+    the GPU if the backend is gsplat. The time is that from the model's parameters to the image, as
+    in gsplat's trainer [ye2025]; the median over the views is our choice.
 
     Args:
         gaussians: The trained model.
         views: The test views, at full size; at least one.
-        conf: The model's settings: the rasterizer's, and the backend.
+        conf: Settings of the model; those of the rasterizer and the backend are read.
 
     Returns:
         The median over the views, ms.
@@ -108,7 +107,7 @@ def render_time(gaussians: Gaussians, views: Sequence[LoadedView], conf: SplatCo
 
 
 def _placed(gaussians: Gaussians, conf: SplatConf) -> Gaussians:
-    """Return the Gaussians where the backend renders them."""
+    """Return the Gaussians on the backend's device."""
     from xrgs.splat.backend import device, resolve_backend
 
     return gaussians.to(device(resolve_backend(conf.backend)))
@@ -146,6 +145,6 @@ def _score(
     from xrgs.runtime.machine import single_torch_thread
 
     image = _render(gaussians, view, conf).clamp(0.0, 1.0).cpu()
-    with torch.no_grad(), single_torch_thread():  # sums over several threads differ in a digit
+    with torch.no_grad(), single_torch_thread():  # the last digit of sums depends on threads
         scores = score_view(image, view.image, view.mask, masked=masked)
     return image, scores

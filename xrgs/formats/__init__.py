@@ -1,1 +1,1 @@
-"""Files of Gaussians, and gsplat's signature."""
+"""File formats of Gaussians, and rendering with gsplat's signature."""

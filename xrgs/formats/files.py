@@ -1,4 +1,4 @@
-"""Files of Gaussians by their format, which the end of the name tells."""
+"""Reads and writes files of Gaussians, in the format of the file's suffix."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ if TYPE_CHECKING:
     from xrgs.splat.gaussians import Gaussians
 
 
-#: The formats that are read, by the end of a file's name; `save_gaussians` writes all of them.
+#: Suffix of a file -> function that reads it. `save_gaussians` writes all these formats.
 READERS: dict[str, Callable[[Path], SavedGaussians]] = {
     ".ply": read_ply,
     ".glb": read_glb,
     ".spz": read_spz,
 }
-#: Where up is in the world of most .ply files.
+#: The up direction of most .ply files.
 _UP = (0.0, -1.0, 0.0)
 
 
 @on_cpu_in_float32
 def load_gaussians(path: str | Path) -> SavedGaussians:
-    """Read a file of Gaussians, and whether they are to be rendered antialiased.
+    """Read a file of Gaussians, and whether to render them antialiased.
 
     Args:
         path: A .ply of any 3DGS trainer, a .glb with KHR_gaussian_splatting, or a .spz of version 2
-            to 4 (4 needs zstandard: pip install 'xrgs[spz]').
+            to 4 (version 4 needs zstandard: pip install 'xrgs[spz]').
 
     Returns:
-        `gaussians`, float32 leaf tensors with gradients on, and `antialiased`.
+        `gaussians`, float32 leaf tensors that require gradients, and `antialiased`.
 
     Raises:
         XrgsError: The file is missing, damaged or of another format; the message names it.
@@ -62,16 +62,16 @@ def save_gaussians(
 ) -> None:
     """Write Gaussians to a .ply, .glb or .spz file, which is replaced atomically.
 
-    .ply and .glb hold float32; .spz is about ten times smaller and holds 8 bits of most values.
+    .ply and .glb store float32. .spz is about ten times smaller, and stores most values in 8 bits.
 
     Args:
         path: The file to write.
         gaussians: The Gaussians.
         antialiased: Whether they were trained with `RasterSettings.antialiased`, for viewers.
-        up: The direction [3] that viewers of a .glb show upwards; the other formats can't hold it.
+        up: The direction [3] that viewers of a .glb show upwards; the other formats don't store it.
 
     Raises:
-        XrgsError: The name ends otherwise, or the format can't hold the Gaussians.
+        XrgsError: The suffix is unknown, or the format can't store the Gaussians.
         OSError: The file can't be written.
 
     Examples:

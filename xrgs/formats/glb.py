@@ -1,12 +1,13 @@
 """Gaussians in .glb files: glTF 2.0 with the extension KHR_gaussian_splatting.
 
-Scales and opacities are stored after their activation functions, quaternions as unit xyzw, and the
+Scales and opacities are stored after the activation functions, quaternions as unit xyzw, and the
 harmonics by coefficient, all as float32. glTF's y axis points up; that of .ply files points down.
-Gaussians are turned so, and their node not: programs differ in whether a node turns harmonics.
+So the Gaussians are rotated when written. Their node is not rotated, since programs differ in
+whether a node rotates harmonics.
 
-The extension names no antialiased Gaussians and sorts by the distance from the camera, where 3D
-Gaussian Splatting sorts by depth. An own file says in `extras` that its Gaussians are antialiased,
-and how they were turned.
+The extension has no flag for antialiased Gaussians, and sorts by distance from the camera, where 3D
+Gaussian Splatting sorts by depth. Files that xrgs writes have in `extras` whether the Gaussians are
+antialiased, and their rotation.
 """
 
 from __future__ import annotations
@@ -45,18 +46,18 @@ if TYPE_CHECKING:
     Json = dict[str, Any]
 
 EXTENSION = "KHR_gaussian_splatting"
-_READ_EXTENSIONS = {EXTENSION, "KHR_mesh_quantization"}  # of those that a file may require
+_READ_EXTENSIONS = {EXTENSION, "KHR_mesh_quantization"}  # supported ones
 _MAGIC, _VERSION, _JSON, _BINARY = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
 _MAX_JSON = 1 << 24  # bytes
 _POINTS = 0
 _VERTEX_DATA = 34962  # the target of a bufferView
 _COMPONENTS = {5120: "i1", 5121: "u1", 5122: "i2", 5123: "u2", 5126: "f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
-#: Half a turn about z: from y down, as in .ply files, to y up. SplatTransform turns them so.
+#: Half a turn about z, from y down as in .ply files to y up, as in SplatTransform.
 _DOWN_TO_UP = np.diag([-1.0, -1.0, 1.0])
-#: The quaternion xyzw by which an own file's Gaussians were turned from their world, in `extras`.
+#: Key in `extras` of files by xrgs: the quaternion xyzw of the rotation from the Gaussians' world.
 _TURNED_BY = "turned_by"
-#: Up to version 0.2.0: the node is turned, which is only for display, and the Gaussians are not.
+#: Key in files by xrgs up to 0.2.0: only the node is rotated, for display, not the Gaussians.
 _DISPLAY = "turned_for_display"
 
 
@@ -72,11 +73,11 @@ def write_glb(
     Args:
         path: The file to write.
         gaussians: The Gaussians; at least one.
-        antialiased: Whether they are to be rendered with `RasterSettings.antialiased`.
-        up: The direction [3] in their world that becomes glTF's +y; they are turned so.
+        antialiased: Whether to render them with `RasterSettings.antialiased`.
+        up: The direction [3] in their world that becomes glTF's +y, by rotating them.
 
     Raises:
-        XrgsError: There are no Gaussians, they have scales that are not finite, or take 4 GB.
+        XrgsError: There are no Gaussians, a value is not finite, or the file would exceed 4 GiB.
         OSError: The file can't be written.
     """
     if len(gaussians) == 0:
@@ -106,34 +107,34 @@ def write_glb(
 
 
 def _attributes(gaussians: Gaussians) -> dict[str, Array]:
-    """Return the arrays of the mesh by the names of their attributes; quaternions are unit ones."""
+    """Return attribute name -> array of the mesh, with unit quaternions."""
     means, quats, scales, opacities, sh0, shN = (
         gaussians[name].detach().double().numpy() for name in PARAMETERS
     )
-    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused by name
+    with np.errstate(over="ignore", invalid="ignore"):  # NaN is refused later
         alpha = 1 / (1 + np.exp(-opacities))
         linear = {"SCALE": np.exp(scales), "ROTATION": quats[:, [1, 2, 3, 0]], "OPACITY": alpha}
         attributes = {f"{EXTENSION}:{name}": values for name, values in linear.items()}
         sh = np.concatenate([sh0, shN], axis=1)  # [N, K, 3]
-        for name, at in _harmonics(sh.shape[1]).items():
-            attributes[name] = sh[:, at]
+        for name, index in _harmonics(sh.shape[1]).items():
+            attributes[name] = sh[:, index]
         floats = {name: values.astype("<f4") for name, values in attributes.items()}
         colors = _fallback_colors(sh0[:, 0], alpha)
     return {"POSITION": means.astype("<f4"), **floats, "COLOR_0": colors}
 
 
 def _harmonics(count: int) -> dict[str, int]:
-    """Return the index of each coefficient by the name of its attribute."""
+    """Return attribute name -> index of the coefficient."""
     names = [
-        f"{EXTENSION}:SH_DEGREE_{band}_COEF_{of}"
+        f"{EXTENSION}:SH_DEGREE_{band}_COEF_{order}"
         for band in range(math.isqrt(count))
-        for of in range(2 * band + 1)
+        for order in range(2 * band + 1)
     ]
-    return {name: at for at, name in enumerate(names)}
+    return {name: index for index, name in enumerate(names)}
 
 
 def _fallback_colors(sh0: Array, alpha: Array) -> Array:
-    """Return the linear colours and opacities [N, 4] uint8 that other viewers draw points with."""
+    """Return linear colours and opacities [N, 4] uint8, for viewers that draw only points."""
     rgb = (C0 * sh0 + 0.5).clip(0, 1)
     linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)  # from sRGB
     return np.asarray((np.column_stack([linear, alpha]) * 255).round().astype(np.uint8))
@@ -142,7 +143,7 @@ def _fallback_colors(sh0: Array, alpha: Array) -> Array:
 def _described(
     attributes: Mapping[str, Array], content: Sequence[bytes], turn: Array, antialiased: bool
 ) -> Json:
-    """Return the JSON of a file with one mesh, whose arrays follow each other in one buffer."""
+    """Return the JSON of a file with one mesh, whose arrays are contiguous in one buffer."""
     accessors: list[Json] = []
     views: list[Json] = []
     offset = 0
@@ -194,13 +195,13 @@ def _described(
 def read_glb(path: Path) -> SavedGaussians:
     """Read the Gaussians of a .glb file.
 
-    They come back with the axes of .ply files, in which y points down: the transformation of their
-    node is applied, then half a turn about z. The Gaussians of an own file come back in the world
-    that they were written from.
+    The result has the axes of .ply files, y down: the transform of the Gaussians' node is applied,
+    then half a turn about z. For files that xrgs has written, the result is in the Gaussians'
+    original world.
 
     Raises:
-        XrgsError: The file can't be read, is damaged, or has no or several models of Gaussians, or
-            Gaussians of a kind that is not served; the message names it.
+        XrgsError: The file can't be read, is damaged, has no model of Gaussians or several, or
+            an unsupported kind of Gaussians; the message names the file.
     """
     try:
         with path.open("rb") as file:
@@ -210,7 +211,7 @@ def read_glb(path: Path) -> SavedGaussians:
     try:
         return _read(path, content)
     except (KeyError, IndexError, TypeError, AttributeError, RecursionError) as error:
-        # The JSON may hold anything anywhere; what follows names what is missing or is misplaced.
+        # Missing or misplaced entries of the JSON raise any of these errors.
         raise XrgsError(f"{path}: is a damaged .glb ({type(error).__name__}: {error})") from error
     except ValueError as error:
         raise XrgsError(f"{path}: {error}") from error
@@ -227,7 +228,7 @@ def _read(path: Path, content: bytes) -> SavedGaussians:
     if extension["kernel"] != "ellipse" or extension["colorSpace"] != "srgb_rec709_display":
         raise ValueError(
             f"Gaussians of kernel {extension['kernel']!r} and colour space "
-            f"{extension['colorSpace']!r} are not served"
+            f"{extension['colorSpace']!r} are not supported"
         )
     arrays = {
         name: _array(description, binary, number)
@@ -236,10 +237,12 @@ def _read(path: Path, content: bytes) -> SavedGaussians:
     }
     check_arrays_finite(path, arrays)
     gaussians = _gaussians(arrays)
-    own = description["nodes"][node].get("extras", {})
-    if not own.get(_DISPLAY):
+    extras = description["nodes"][node].get("extras", {})
+    if not extras.get(_DISPLAY):
         world = _to_world(description["nodes"], node)
-        turn = Rotation.from_quat(own[_TURNED_BY]).as_matrix() if _TURNED_BY in own else _DOWN_TO_UP
+        turn = _DOWN_TO_UP
+        if _TURNED_BY in extras:
+            turn = Rotation.from_quat(extras[_TURNED_BY]).as_matrix()
         world[:3] = turn.T @ world[:3]
         try:
             gaussians = transformed(gaussians, world)
@@ -267,16 +270,16 @@ def _chunks(content: bytes) -> tuple[Json, bytes]:
 
 def _model(description: Json) -> tuple[int, Json]:
     """Return the node and the primitive of the only model of Gaussians."""
-    found = [
+    models = [
         (number, primitive)
         for number, node in enumerate(description.get("nodes", []))
         if "mesh" in node
         for primitive in description["meshes"][node["mesh"]]["primitives"]
         if EXTENSION in primitive.get("extensions", {})
     ]
-    if len(found) != 1:
-        raise ValueError(f"has {len(found)} models of {EXTENSION}; one is read")
-    return found[0]
+    if len(models) != 1:
+        raise ValueError(f"has {len(models)} models of {EXTENSION}; one is read")
+    return models[0]
 
 
 def _array(description: Json, binary: bytes, number: int) -> NDArray[np.float64]:
@@ -303,13 +306,13 @@ def _array(description: Json, binary: bytes, number: int) -> NDArray[np.float64]
 
 def _gaussians(arrays: Mapping[str, NDArray[np.float64]]) -> Gaussians:
     bands = [_harmonics(bases(degree)) for degree in range(MAX_DEGREE + 1)]
-    names = max((of for of in bands if of.keys() <= arrays.keys()), key=len, default=bands[0])
+    names = max((band for band in bands if band.keys() <= arrays.keys()), key=len, default=bands[0])
     widths = {"POSITION": 3, **dict.fromkeys(names, 3)}
     widths |= {
         f"{EXTENSION}:{name}": width
         for name, width in (("ROTATION", 4), ("SCALE", 3), ("OPACITY", 1))
     }
-    # A draft of the extension had other names; a band that is not whole would be left out.
+    # A draft of the extension had other names, and an incomplete band would be ignored.
     if differing := sorted(widths.keys() ^ arrays.keys()):
         raise ValueError(f"has too few or too many attributes: {', '.join(differing)}")
     for name, width in widths.items():
@@ -336,19 +339,19 @@ def _gaussians(arrays: Mapping[str, NDArray[np.float64]]) -> Gaussians:
 
 def _to_world(nodes: Sequence[Json], node: int) -> NDArray[np.float64]:
     """Return the global transformation [4, 4] of a node."""
-    parents = {child: at for at, of in enumerate(nodes) for child in of.get("children", [])}
-    matrix, at = np.eye(4), node
-    for _ in nodes:  # a damaged file may have a circle
-        matrix = _local(nodes[at]) @ matrix
-        if at not in parents:
+    parents = {child: i for i, parent in enumerate(nodes) for child in parent.get("children", [])}
+    matrix, number = np.eye(4), node
+    for _ in nodes:  # bounded, since a damaged file may have a cycle
+        matrix = _local(nodes[number]) @ matrix
+        if number not in parents:
             break
-        at = parents[at]
+        number = parents[number]
     return matrix
 
 
 def _local(node: Json) -> NDArray[np.float64]:
     if "matrix" in node:
-        return np.array(node["matrix"], np.float64).reshape(4, 4).T  # by column in the file
+        return np.array(node["matrix"], np.float64).reshape(4, 4).T  # column-major in the file
     matrix = np.eye(4)
     rotation = Rotation.from_quat(node.get("rotation", [0, 0, 0, 1])).as_matrix()
     matrix[:3, :3] = rotation * np.array(node.get("scale", [1, 1, 1]), np.float64)

@@ -1,7 +1,7 @@
 """gsplat's `rasterization` on the CPU: the signature and the results of gsplat 1.5.3.
 
-Code that calls `gsplat.rasterization` on a GPU runs here by importing it from `xrgs` instead. An
-argument that is not served raises an error that names it.
+To run code that calls `gsplat.rasterization` on a GPU, import the function from this module
+instead. Unsupported arguments raise an error that names them.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ RasterizeMode = Literal["classic", "antialiased"]
 ALPHA_MIN, ALPHA_MAX, TRANSMITTANCE_MIN = 1.0 / 255.0, 0.999, 1e-4
 MAX_RADIUS_SIGMAS = 3.33
 MAX_RADIUS = 2.0**31 - 128
-"""Largest radius in `meta`, px: of an int32, and a float32 too."""
+"""Largest radius in `meta`, px: the largest int32 that float32 can represent."""
 MIN_DEPTH_ALPHA = 1e-10
-"""Smallest alpha by which the expected depth is divided."""
+"""Lower limit of the alpha in the denominator of the expected depth."""
 
 
 class _Shapes(NamedTuple):
-    """The parameters that decide where Gaussians are drawn, and how opaque they are."""
+    """The parameters of shape, position and opacity."""
 
     means: Tensor  # [N, 3]
     quats: Tensor  # [N, 4]
@@ -46,7 +46,7 @@ class _Shapes(NamedTuple):
 
 
 class _Projections(NamedTuple):
-    """All Gaussians on the image planes of C cameras; zeros where a Gaussian is not drawn."""
+    """All Gaussians on the image planes of C cameras; zeros for Gaussians that are not drawn."""
 
     radii: Tensor  # [C, N, 2] int32, px
     means2d: Tensor  # [C, N, 2] px
@@ -78,10 +78,10 @@ def rasterization(
     sparse_grad: bool = False,
     absgrad: bool = False,
     rasterize_mode: RasterizeMode = "classic",
-    channel_chunk: int = 32,  # noqa: ARG001 - changes gsplat's speed alone
+    channel_chunk: int = 32,  # noqa: ARG001 - changes only gsplat's speed
     distributed: bool = False,
     camera_model: str = "pinhole",
-    segmented: bool = False,  # noqa: ARG001 - changes gsplat's speed alone
+    segmented: bool = False,  # noqa: ARG001 - changes only gsplat's speed
     covars: Tensor | None = None,
     with_ut: bool = False,
     with_eval3d: bool = False,
@@ -97,8 +97,8 @@ def rasterization(
     """Render Gaussians into C cameras as `gsplat.rasterization` of gsplat 1.5.3 does.
 
     The results are differentiable in means, quats, scales, opacities, colors and backgrounds.
-    Each camera is rendered on its own, three channels at a time: RGB+D and RGB+ED take two passes
-    a camera, D channels take D / 3, rounded up.
+    Each camera is rendered separately, three channels at a time: RGB+D and RGB+ED take two passes
+    for each camera, D channels take D / 3 passes, rounded up.
 
     Args:
         means: [N, 3] world units.
@@ -106,57 +106,58 @@ def rasterization(
         scales: [N, 3] world units (not logarithms).
         opacities: [N] in 0..1 (not logits).
         colors: With `sh_degree`, coefficients of spherical harmonics [N, K, 3] or [C, N, K, 3];
-            without it, colours or other features after activation, [N, D] or [C, N, D].
+            without `sh_degree`, colours or other features after activation, [N, D] or [C, N, D].
         viewmats: [C, 4, 4] world to camera, rigid; without gradients.
         Ks: [C, 3, 3] intrinsics in px, without skew; without gradients.
         width: Width of the images, px.
         height: Height of the images, px.
         near_plane: Gaussians nearer than this are not drawn, world units along z.
         far_plane: Gaussians farther than this are not drawn, world units along z.
-        radius_clip: Gaussians whose radii are not above this are not drawn, px.
+        radius_clip: Gaussians with radii of this or less are not drawn, px.
         eps2d: Variance added to each projected covariance, px^2.
-        sh_degree: Highest band of the spherical harmonics that is evaluated, 0 to 3; None takes
-            `colors` as they are.
+        sh_degree: Highest evaluated band of the spherical harmonics, 0 to 3; None if `colors` are
+            not harmonics.
         packed: Whether `meta` holds one entry for each drawn Gaussian, or all [C, N].
         tile_size: Only returned in `meta`: it does not change the image.
-        backgrounds: [C, D] colour behind the last Gaussian; None is black. Depth has none.
+        backgrounds: [C, D] colour behind the last Gaussian; None is black. Depth ignores it.
         render_mode: `RGB` colours, `D` the accumulated z-depth, `ED` the expected z-depth (`D` over
             alpha), or colours with either as the last channel.
-        sparse_grad: Not served.
-        absgrad: Store the sum of absolute image-plane gradients in `meta["means2d"].absgrad` by the
-            backward pass; `meta["means2d"].grad` then stays None. Served for one pass a camera.
+        sparse_grad: Not supported.
+        absgrad: In the backward pass, store the sums of absolute image-plane gradients in
+            `meta["means2d"].absgrad`; `meta["means2d"].grad` then stays None. Supported only for up
+            to three channels (one pass for each camera).
         rasterize_mode: `antialiased` compensates opacities for `eps2d`, as Mip-Splatting does.
-        channel_chunk: Without effect.
-        distributed: Not served.
-        camera_model: Only `pinhole` is served.
-        segmented: Without effect.
-        covars: Not served; give quats and scales.
-        with_ut: Not served.
-        with_eval3d: Not served.
-        radial_coeffs: Not served.
-        tangential_coeffs: Not served.
-        thin_prism_coeffs: Not served.
-        ftheta_coeffs: Not served.
+        channel_chunk: Ignored.
+        distributed: Not supported.
+        camera_model: Only `pinhole` is supported.
+        segmented: Ignored.
+        covars: Not supported; use quats and scales.
+        with_ut: Not supported.
+        with_eval3d: Not supported.
+        radial_coeffs: Not supported.
+        tangential_coeffs: Not supported.
+        thin_prism_coeffs: Not supported.
+        ftheta_coeffs: Not supported.
         rolling_shutter: None, or gsplat's `RollingShutterType.GLOBAL`.
-        viewmats_rs: Not served.
-        backend: `native`, `torch`, or `auto`: native for float32 where the extension was built,
-            else torch. gsplat has no such argument.
+        viewmats_rs: Not supported.
+        backend: `native`, `torch`, or `auto`: native for float32 if the extension was built, else
+            torch. gsplat has no such argument.
 
     Returns:
-        The colours [C, H, W, X], X the channels of the render mode; alpha [C, H, W, 1]; and `meta`.
-        `meta` has `radii` (int32, px; 0 where not drawn), `means2d` (px), `depths`, `conics` and
+        Colours [C, H, W, X] for the X channels of the render mode, alpha [C, H, W, 1], and `meta`.
+        `meta` has `radii` (int32, px; 0 if not drawn), `means2d` (px), `depths`, `conics` and
         `opacities`, with `camera_ids`, `gaussian_ids` and `batch_ids` if packed (else None), and
-        `width`, `height`, `tile_size`, `n_cameras`, `n_batches`. The intersections with tiles
-        (`isect_ids`, `isect_offsets`, `flatten_ids`, `tiles_per_gauss`) are not in it.
+        `width`, `height`, `tile_size`, `n_cameras`, `n_batches`. It lacks the intersections with
+        tiles (`isect_ids`, `isect_offsets`, `flatten_ids`, `tiles_per_gauss`).
 
         `meta["means2d"]` is a leaf: after the backward pass its `.grad` is the image-plane gradient
-        that gsplat's `DefaultStrategy` reads, so the strategy runs on this function. No gradient
-        flows from `meta` to the Gaussians: a loss on `meta` itself is not served.
+        for gsplat's `DefaultStrategy`, so the strategy works with this function. Gradients do not
+        flow from `meta` to the Gaussians: a loss on `meta` is not supported.
 
     Raises:
-        NotImplementedError: An argument has a value that is not served; the message names it.
-        TypeError: An argument is no tensor, as a numpy array or None, or `width`, `height` or
-            `sh_degree` is no whole number. The message names the argument.
+        NotImplementedError: An argument has an unsupported value; the message names the argument.
+        TypeError: An argument is not a tensor (a numpy array or None, for example), or `width`,
+            `height` or `sh_degree` is not a whole number. The message names the argument.
         ValueError: A tensor has a wrong shape, is not float32 or float64, or has values that are
             not finite; opacities are outside 0..1; a camera is not rigid or has skew. The message
             names the argument.
@@ -236,7 +237,7 @@ def _refuse(**given: bool) -> None:
     for name, is_given in given.items():
         if is_given:
             raise NotImplementedError(
-                f"{name}: rasterization serves only its default; leave it out"
+                f"{name}: rasterization supports only its default; leave it out"
             )
 
 
@@ -246,7 +247,7 @@ def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
 
 
 def _check_tensors(values: dict[str, Tensor]) -> None:
-    """Check that values are float tensors on the CPU; those of Gaussians of the type of means."""
+    """Check that values are float tensors on the CPU, and Gaussians' values of the means' dtype."""
     for name, value in values.items():
         if not isinstance(value, torch.Tensor):
             got = "None" if value is None else type(value).__name__
@@ -274,7 +275,7 @@ def _whole(name: str, value: int) -> int:
 
 
 def _check_values(shapes: _Shapes, colors: Tensor, backgrounds: Tensor | None) -> None:
-    """Check the values of all Gaussians: the rasterizer sees only those that are drawn."""
+    """Check the values of all Gaussians; the rasterizer would check only those that are drawn."""
     named = {**shapes._asdict(), "colors": colors, "backgrounds": backgrounds}
     for name, value in named.items():
         if value is not None and not torch.isfinite(value).all():
@@ -290,7 +291,7 @@ def _check_values(shapes: _Shapes, colors: Tensor, backgrounds: Tensor | None) -
 def _check_shapes(
     shapes: _Shapes, colors: Tensor, cameras: int, sh_degree: int | None, backgrounds: Tensor | None
 ) -> None:
-    """Check the shapes that the code below relies on."""
+    """Check the shapes of all tensors."""
     if shapes.means.ndim != 2:
         raise ValueError(
             f"means must be [N, 3], without a batch before it, got {list(shapes.means.shape)}"
@@ -349,7 +350,7 @@ def _project(
     far_plane: float,
     radius_clip: float,
 ) -> _Projections:
-    """Project every Gaussian into every camera and find its radii as gsplat's kernels do."""
+    """Project every Gaussian into every camera, and compute its radii as gsplat's kernels do."""
     views = []
     for camera in cameras:
         z = camera_depths(shapes.means, camera)
@@ -357,7 +358,7 @@ def _project(
         means, quats, scales, opacities = (value[chosen] for value in shapes)
         flat = project(means, quats, scales, opacities, camera, settings)
         xx, xy, yy = flat.cov.unbind(-1)
-        # A box around all that alpha_min lets be seen (StopThePop, section B.2).
+        # A box around the ellipse of alpha >= alpha_min (StopThePop, section B.2).
         reach = (2 * torch.log(flat.opacities / settings.alpha_min)).clamp_min(0).sqrt()
         reach = reach.clamp_max(MAX_RADIUS_SIGMAS)[:, None]  # [M, 1] standard deviations
         radii = (reach * torch.stack([xx, yy], dim=-1).sqrt()).ceil()  # [M, 2]
@@ -378,7 +379,7 @@ def _project(
 
 
 def _scatter(values: Tensor, chosen: Tensor, drawn: Tensor, count: int) -> Tensor:
-    """Place the values [M, ...] of drawn Gaussians among zeros [N, ...]."""
+    """Scatter the values [M, ...] of drawn Gaussians into zeros [N, ...]."""
     placed = values.new_zeros((count, *values.shape[1:]))
     placed[chosen[drawn]] = values[drawn]
     return placed
@@ -387,10 +388,10 @@ def _scatter(values: Tensor, chosen: Tensor, drawn: Tensor, count: int) -> Tenso
 def _meta(
     projections: _Projections, packed: bool, requires_grad: bool, absgrad: bool
 ) -> tuple[dict[str, Any], Tensor]:
-    """Make gsplat's `meta`, and the offsets [C, N, 2] that send gradients to its `means2d`.
+    """Make gsplat's `meta`, and zero offsets [C, N, 2] whose gradients go to its `means2d`.
 
-    The offsets are zeros. The rasterizer adds them to its own projected means, so that the gradient
-    of an offset is the gradient of a projected mean.
+    The rasterizer adds the offsets to the projected means, so that the gradient of an offset is the
+    gradient of a projected mean.
     """
     drawn = (projections.radii > 0).all(dim=-1)  # [C, N]
     camera_ids, gaussian_ids = torch.nonzero(drawn, as_tuple=True)
@@ -415,7 +416,7 @@ def _meta(
 
 
 class _AbsoluteGradient(torch.autograd.Function):
-    """Zeros of the shape of means2d, whose gradient becomes `means2d.absgrad`."""
+    """Return zeros of the shape of means2d, whose gradient is stored in `means2d.absgrad`."""
 
     @staticmethod
     def forward(ctx: Any, means2d: Tensor) -> Tensor:
@@ -428,7 +429,7 @@ class _AbsoluteGradient(torch.autograd.Function):
 
 
 class _Renderer(NamedTuple):
-    """The arguments that all cameras of a call share."""
+    """Renders one camera after another; the fields are the arguments common to all cameras."""
 
     shapes: _Shapes
     settings: RasterSettings
@@ -444,13 +445,13 @@ class _Renderer(NamedTuple):
         drawn: Tensor,
         background: Tensor | None,
     ) -> tuple[Tensor, Tensor]:
-        """Render one camera: its channels [H, W, X] and alpha [H, W, 1].
+        """Render the channels [H, W, X] and alpha [H, W, 1] of one camera.
 
         Args:
             camera: The view.
             colors: [N, K, 3] coefficients, or [N, D] colours.
             offset: [N, 2] zeros, for the gradients of the projected means.
-            drawn: [N] which Gaussians are drawn.
+            drawn: [N] bool, whether the Gaussian is drawn.
             background: [D] colour behind the last Gaussian; None is black.
         """
         hidden = torch.where(drawn, self.shapes.opacities, 0.0)
@@ -468,7 +469,7 @@ class _Renderer(NamedTuple):
             layers += self._features(shapes, values, camera, offset)
         if self.settings.absgrad and len(layers) > 1:
             raise NotImplementedError(
-                f"absgrad: rasterization serves it for up to three channels, "
+                f"absgrad: rasterization supports it for up to three channels, "
                 f"not for this render_mode={self.render_mode!r} and colors"
             )
         image = torch.cat([layer for layer, _ in layers], dim=-1)
@@ -494,11 +495,11 @@ class _Renderer(NamedTuple):
     def _features(
         self, shapes: _Shapes, features: Tensor, camera: Camera, offset: Tensor
     ) -> list[tuple[Tensor, Tensor]]:
-        """Render features [N, D] of any sign and size, three channels a pass.
+        """Render features [N, D] of any sign and size, three channels in each pass.
 
-        The rasterizer draws max(C0 sh0 + 1/2, 0). So that nothing is cut off at 0, features are
-        scaled to -1..1 by a power of two, which is exact, and raised to at least 1/2. Compositing
-        is linear: what was added is subtracted again, times alpha.
+        The rasterizer draws max(C0 sh0 + 1/2, 0). So that no feature is clamped, features are
+        scaled to -1..1 by a power of two, which is exact, and increased by a constant. Compositing
+        is linear, so the constant times alpha is subtracted from the result.
         """
         layers = []
         for group in features.split(3, dim=1):
@@ -515,7 +516,7 @@ class _Renderer(NamedTuple):
         return layers
 
     def _finished(self, image: Tensor, alpha: Tensor, background: Tensor | None) -> Tensor:
-        """Put the background behind the colours, and divide the depth where it is expected."""
+        """Add the background to the colours, and divide an expected depth by alpha."""
         channels = image.shape[-1] - ("D" in self.render_mode)
         colors, depth = image[..., :channels], image[..., channels:]
         if background is not None:

@@ -1,6 +1,6 @@
-"""Gaussians as .ply files in the layout of INRIA, which viewers of 3D Gaussian Splatting open.
+"""Gaussians as .ply files with INRIA's layout, for viewers of 3D Gaussian Splatting.
 
-A file has one vertex for each Gaussian with its raw parameters (logit opacities, log scales). The
+A file has a vertex for each Gaussian, with raw parameters (logit opacities, log scales). The
 harmonics above band 0 are stored by channel: all coefficients of red, then green, then blue.
 """
 
@@ -43,10 +43,11 @@ _log = logging.getLogger(__name__)
 
 _NORMALS = ("nx", "ny", "nz")
 ANTIALIASED_LINE = b"comment SplatRenderMode: mip\n"
-"""The line of Brush and of SuperSplat's converter for antialiased Gaussians."""
-#: How comments say it, in lower case: `SplatRenderMode: mip`, or Postshot's `antialiased 1`.
+"""Header line for antialiased Gaussians, as of Brush and SuperSplat's converter."""
+#: Comments for antialiased Gaussians, in lower case: `SplatRenderMode: mip`, or Postshot's
+#: `antialiased 1`.
 _RENDER_MODE = re.compile(r"splatrendermode:\s*(\S+)|antialiased\s+([01])")
-#: Harmonics of more bands are in no file that a trainer writes.
+#: Limit of the degree of harmonics; trainers write lower degrees.
 _HIGHEST = 16
 
 
@@ -66,10 +67,10 @@ def save_ply(
         gaussians: The N Gaussians; they are written as little-endian float32, in raw parameters
             (logarithms of scales, logits of opacities) and unit quaternions.
         antialiased: Whether they were trained with `RasterSettings.antialiased`. The header then
-            has the comment `SplatRenderMode: mip`, by which viewers know how to draw them.
-        durable: Whether to wait until the content and the name are on the disk.
-        exact: Whether quaternions keep their length, so that the file has every bit of the
-            Gaussians. Some programs turn Gaussians whose quaternions are no unit ones.
+            has the comment `SplatRenderMode: mip`, which tells viewers to draw them so.
+        durable: Whether to wait until content and name are synced to the disk.
+        exact: Whether to keep the length of quaternions, so that all bits are preserved. Some
+            programs draw Gaussians wrongly if the quaternions are not of unit length.
 
     Raises:
         OSError: The file can't be written.
@@ -81,7 +82,7 @@ def save_ply(
     unit = torch.from_numpy(unit_quaternions(gaussians.quats))
     columns = [
         gaussians.means,
-        torch.zeros_like(gaussians.means),  # normals, which viewers expect and do not use
+        torch.zeros_like(gaussians.means),  # normals, which viewers expect but ignore
         gaussians.sh0[:, 0],
         gaussians.shN.transpose(1, 2).flatten(1),
         gaussians.opacities[:, None],
@@ -103,22 +104,22 @@ def save_ply(
 
 @on_cpu_in_float32
 def load_ply(path: str | Path) -> Gaussians:
-    """Read Gaussians that `save_ply`, or any 3D Gaussian Splatting trainer, wrote.
+    """Read the Gaussians of a .ply by `save_ply` or any 3D Gaussian Splatting trainer.
 
-    Properties may come in any order and of any type, among others, in text or binary. Bands of the
-    harmonics above 3 are left out, with a warning. An infinite logit of an opacity and a
-    logarithm of a scale of -inf become finite values that render the same. The filter of
-    Mip-Splatting (`filter_3D`) is applied to the scales and opacities.
+    The file may be text or binary. Properties may have any order and type, and further properties
+    are ignored. Bands of the harmonics above 3 are left out, with a warning. Infinite logits of
+    opacities, and logarithms of scales of -inf, become finite values that render the same. The
+    filter of Mip-Splatting (`filter_3D`) is applied to scales and opacities.
 
     Args:
         path: The .ply file.
 
     Returns:
-        float32 leaf tensors with gradients on. A warning says that they are antialiased where the
-        file does; `load_gaussians` returns it.
+        float32 leaf tensors that require gradients. A warning says if the Gaussians are antialiased
+        according to the file; `load_gaussians` returns this.
 
     Raises:
-        XrgsError: The file is missing, damaged or no such .ply; the message names it.
+        XrgsError: The file is missing, damaged or not a .ply of Gaussians; the message names it.
 
     Examples:
         >>> gaussians = load_ply("splats.ply")
@@ -137,7 +138,7 @@ def load_ply(path: str | Path) -> Gaussians:
 
 
 def read_ply(path: Path) -> SavedGaussians:
-    """Read Gaussians as `load_ply` does, and whether they are to be rendered antialiased."""
+    """Read Gaussians as `load_ply` does, and whether to render them antialiased."""
     check_is_read(path)
     file = ply.read(path)
     names = _columns(path, file.names)
@@ -152,12 +153,12 @@ def read_ply(path: Path) -> SavedGaussians:
         sizes = file.columns(["filter_3D"], np.float64)
         check_finite(path, sizes, ["filter_3D"])
         scales[:], opacities[:] = _filtered(scales, opacities, sizes)
-        antialiased = True  # Mip-Splatting renders so
+        antialiased = True  # as Mip-Splatting renders
     check_finite(path, table, names)
     values = {
         "means": table[:, :3],
         "sh0": table[:, None, 3:6],
-        # By channel in the file, and by band in memory.
+        # The file stores shN by channel, memory by coefficient.
         "shN": table[:, 6:-8].reshape(len(table), 3, (len(names) - 14) // 3).swapaxes(1, 2),
         "opacities": opacities,
         "scales": scales,
@@ -167,12 +168,12 @@ def read_ply(path: Path) -> SavedGaussians:
 
 
 def _is_antialiased(comments: Sequence[str]) -> bool:
-    found = [match for text in comments if (match := _RENDER_MODE.fullmatch(text.lower()))]
-    return bool(found) and (found[-1][1] == "mip" or found[-1][2] == "1")
+    matches = [match for text in comments if (match := _RENDER_MODE.fullmatch(text.lower()))]
+    return bool(matches) and (matches[-1][1] == "mip" or matches[-1][2] == "1")
 
 
 def _properties(rest: int) -> list[str]:
-    """Return a vertex's columns, with `rest` SH coefficients above band 0 for each channel."""
+    """Return the names of a vertex's properties, with `rest` SH coefficients above band 0."""
     return [
         *("x", "y", "z"),
         *_NORMALS,
@@ -185,10 +186,10 @@ def _properties(rest: int) -> list[str]:
 
 
 def _columns(path: Path, names: Sequence[str]) -> list[str]:
-    """Return the properties that hold the parameters, in the order of `_properties`.
+    """Return the names of the file's properties for all parameters, in the order of `_properties`.
 
     Raises:
-        XrgsError: Some are missing; the message says what the file seems to be instead.
+        XrgsError: Properties are missing; the message says what kind of file it seems to be.
     """
     if "packed_position" in names:
         raise XrgsError(
@@ -203,7 +204,7 @@ def _columns(path: Path, names: Sequence[str]) -> list[str]:
     if missing == ["scale_2"]:
         raise XrgsError(
             f"{path}: has no scale_2: these are the flat Gaussians of 2D Gaussian Splatting, "
-            "which is not served"
+            "which are not supported"
         )
     if missing:
         kind = "" if "opacity" in names else "a point cloud and no Gaussians: "
@@ -224,11 +225,11 @@ def _columns(path: Path, names: Sequence[str]) -> list[str]:
 
 
 def _filtered(scales: Table, opacities: Table, sizes: NDArray[np.float64]) -> tuple[Any, Any]:
-    """Convolve Gaussians with isotropic ones of standard deviation `sizes` [N, 1], as in training.
+    """Convolve Gaussians with isotropic ones of standard deviation `sizes` [N, 1].
 
-    `xrgs.training.components.mip` has the formula.
+    The formula is in `xrgs.training.components.mip`.
     """
-    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused later
+    with np.errstate(over="ignore", invalid="ignore"):  # NaN is refused later
         variances = np.exp(2 * scales.astype(np.float64))
         filtered = variances + sizes**2
         alpha = 1 / (1 + np.exp(-opacities.astype(np.float64)))

@@ -1,4 +1,4 @@
-"""What the formats of files of Gaussians share: the result of reading one, and its checks."""
+"""The result of reading a file of Gaussians, and checks for all formats."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 CERTAIN_LOGIT = 100.0
-"""Stands for an infinite logit: float32 rounds the opacity to 1, and to less than 1e-43."""
+"""Replaces an infinite logit, up to sign: in float32 the opacity becomes 1, or less than 1e-43."""
 FLAT_LOG_SCALE = -40.0
-"""Stands for the logarithm of a scale of 0; the square of the scale is still a normal float32."""
-#: Formats of others by the ends of their files' names.
+"""Replaces the logarithm of a scale of 0; the square of this scale is still a normal float32."""
+#: End of a file's name -> format that is not supported.
 _NOT_READ = {
     ".splat": "antimatter15's",
     ".ksplat": "mkkellogg's",
@@ -38,12 +38,12 @@ class SavedGaussians(NamedTuple):
 
     gaussians: Gaussians
     antialiased: bool
-    """Whether the file says that they were trained with the 2D filter of Mip-Splatting, so that
-    they are to be rendered with `RasterSettings(antialiased=True)`."""
+    """Whether, according to the file, the Gaussians were trained with the 2D filter of
+    Mip-Splatting. If so, render them with `RasterSettings(antialiased=True)`."""
 
 
 def check_finite(path: Path, table: NDArray[Any], names: Sequence[str]) -> None:
-    """Raise XrgsError for a value of a table [N, C] that is not finite; the columns have names."""
+    """Raise XrgsError if a table [N, C] has a value that is not finite; `names` are the columns."""
     if not np.isfinite(table).all():
         row, column = np.argwhere(~np.isfinite(table))[0]
         raise XrgsError(
@@ -53,17 +53,17 @@ def check_finite(path: Path, table: NDArray[Any], names: Sequence[str]) -> None:
 
 
 def check_arrays_finite(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Raise XrgsError for a value of arrays [N, ...] by their names that is not finite."""
+    """Raise XrgsError if one of the arrays (name -> [N, ...]) has a value that is not finite."""
     for name, values in arrays.items():
         width = math.prod(values.shape[1:])
         check_finite(path, values.reshape(len(values), width), [name] * width)
 
 
 def unit_quaternions(quats: Tensor) -> NDArray[np.float64]:
-    """Return quaternions [N, 4] wxyz of length 1, which other programs expect in files.
+    """Return quaternions [N, 4] wxyz normalised to length 1, as other programs expect.
 
-    float64 holds the squares of all float32. A quaternion of zeros becomes the identity, as it is
-    rendered; one with a value that is not finite becomes NaN.
+    float64 can represent the square of any float32. A zero quaternion becomes the identity, as in
+    rendering; a quaternion with a value that is not finite becomes NaN.
     """
     values = quats.detach().double().numpy()
     with np.errstate(invalid="ignore"):
@@ -73,7 +73,7 @@ def unit_quaternions(quats: Tensor) -> NDArray[np.float64]:
 
 
 def to_gaussians(values: Mapping[str, NDArray[Any]]) -> Gaussians:
-    """Return float32 leaf tensors with gradients on, from arrays by the names of parameters."""
+    """Convert parameter name -> array to Gaussians: float32 leaf tensors that require gradients."""
     tensors = {
         name: torch.from_numpy(np.array(values[name], np.float32, order="C")) for name in PARAMETERS
     }
@@ -81,14 +81,14 @@ def to_gaussians(values: Mapping[str, NDArray[Any]]) -> Gaussians:
 
 
 def check_is_read(path: Path) -> None:
-    """Raise XrgsError for a file in a format that is known and not read, by its name."""
+    """Raise XrgsError if the file's name is that of an unsupported format."""
     for end, whose in _NOT_READ.items():
         if path.name.lower().endswith(end):
             raise XrgsError(f"{path}: {whose} format is not read; {converted_by(path)}")
 
 
 def converted_by(path: Path) -> str:
-    """Return the end of a message about a format that is not read: the command that converts it."""
+    """Return the end of an error message: the command that converts an unsupported format."""
     result = path.with_suffix(".ply")
     if result == path:
         result = path.with_name(f"{path.stem.removesuffix('.compressed')}-plain.ply")

@@ -1,4 +1,4 @@
-"""Moves Gaussians from one world to another: rotation, scale and translation."""
+"""Transforms Gaussians by a similarity: rotation, scale and translation."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from xrgs.splat.sh import bases, sh_basis
 if TYPE_CHECKING:
     from torch import Tensor
 
-#: How far the axes of a similarity may be from equally long and perpendicular ones, as a share.
+#: Relative tolerance for the axes of a similarity to be perpendicular and of equal length.
 _TOLERANCE = 1e-4
 
 
 def transformed(gaussians: Gaussians, similarity: NDArray[np.float64]) -> Gaussians:
-    """Return Gaussians in another world, where cameras that moved as well see the same.
+    """Transform Gaussians to another world, so that transformed cameras see the same image.
 
     Args:
         gaussians: N Gaussians.
@@ -29,10 +29,10 @@ def transformed(gaussians: Gaussians, similarity: NDArray[np.float64]) -> Gaussi
             scale above 0, and a translation.
 
     Returns:
-        float32 leaf tensors with gradients on, with unit quaternions; computed in float64.
+        float32 leaf tensors that require gradients, with unit quaternions; computed in float64.
 
     Raises:
-        ValueError: The matrix is no such similarity.
+        ValueError: The matrix is not such a similarity.
     """
     linear = similarity[:3, :3]
     determinant = float(np.linalg.det(linear)) if np.isfinite(similarity).all() else 0.0
@@ -44,7 +44,7 @@ def transformed(gaussians: Gaussians, similarity: NDArray[np.float64]) -> Gaussi
     rotation = linear / scale
     if not np.allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=_TOLERANCE):
         raise ValueError("must be a rotation times one scale for all axes, without shear")
-    # A mirror turns an ellipsoid as its negative does, which is a rotation.
+    # A mirror changes an ellipsoid in the same way as its negative, which is a rotation.
     proper = Rotation.from_matrix(rotation * np.sign(determinant))
     values = {
         "means": gaussians.means.detach().double() @ torch.from_numpy(linear.T.copy())
@@ -55,21 +55,21 @@ def transformed(gaussians: Gaussians, similarity: NDArray[np.float64]) -> Gaussi
         "sh0": gaussians.sh0.detach(),
         "shN": _turned_harmonics(gaussians.shN.detach().double(), torch.from_numpy(rotation)),
     }
-    return Gaussians(**{name: of.float().clone().requires_grad_() for name, of in values.items()})
+    return Gaussians(**{name: x.float().clone().requires_grad_() for name, x in values.items()})
 
 
 def _product(turn: Rotation, quats: Tensor) -> Tensor:
-    """Return the quaternions [N, 4] wxyz of rotations that are followed by a turn."""
+    """Return the quaternions [N, 4] wxyz of first the rotations `quats`, then `turn`."""
     x, y, z, w = (float(value) for value in turn.as_quat())
     matrix = [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]
     return quats @ torch.tensor(matrix, dtype=torch.float64).T
 
 
 def _turned_harmonics(coefficients: Tensor, turn: Tensor) -> Tensor:
-    """Return coefficients [N, K - 1, 3] whose function f' has f'(turn d) = f(d) for all d.
+    """Rotate or mirror harmonics: return coefficients [N, K - 1, 3] of f' with f'(turn d) = f(d).
 
-    A turn or a mirror mixes only the harmonics of a band among each other. How is found from their
-    values at more directions than there are harmonics, which determine it exactly.
+    A rotation or mirror mixes only the harmonics within a band. The mixing matrix is solved for
+    from the values of the harmonics at more directions than there are harmonics.
     """
     degree = round((coefficients.shape[1] + 1) ** 0.5) - 1
     dirs = torch.randn((64, 3), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -77,8 +77,8 @@ def _turned_harmonics(coefficients: Tensor, turn: Tensor) -> Tensor:
     before, after = sh_basis(degree, dirs @ turn), sh_basis(degree, dirs)  # [64, K]
     turned = torch.zeros_like(coefficients)
     for band in range(1, degree + 1):
-        of = slice(bases(band - 1), bases(band))
-        mixing = torch.linalg.lstsq(after[:, of], before[:, of]).solution  # [2l + 1, 2l + 1]
-        rest = slice(of.start - 1, of.stop - 1)
+        columns = slice(bases(band - 1), bases(band))
+        mixing = torch.linalg.lstsq(after[:, columns], before[:, columns]).solution  # [2l+1, 2l+1]
+        rest = slice(columns.start - 1, columns.stop - 1)
         turned[:, rest] = torch.einsum("jk,nkc->njc", mixing, coefficients[:, rest])
     return turned

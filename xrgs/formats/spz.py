@@ -1,14 +1,15 @@
 """Gaussians in .spz files, Niantic's compressed format.
 
-Versions 2 and 3 are one gzip stream. Version 4 has the same content in streams of zstd. Own files
-are of version 3, which needs no zstd; docs/export.md says which programs read it.
+Versions 2 and 3 are a gzip stream. Version 4 has the same content in several zstd streams. xrgs
+writes version 3, which does not need zstd; docs/export.md lists programs that read it.
 
-Positions are 24-bit fixed-point numbers, unit quaternions take 32 bits, and all else takes 8 bits
-each.
+Positions are 24-bit fixed-point numbers, unit quaternions have 32 bits, and all other numbers have
+8 bits.
 
-The axes are those of the .ply that a file was made of: Niantic's converter and its successors write
-coordinates as they are, whatever the format's description says of its axes. A file that names its
-axes (Adobe's extension 0xADBE0003) is turned to right, down, forward, the axes of .ply files.
+The axes are those of the .ply that a file was made from: Niantic's converter and its successors
+write coordinates unchanged, against the format's description of its axes. If a file names its axes
+(Adobe's extension 0xADBE0003), the Gaussians are rotated to right, down, forward, the axes of .ply
+files.
 """
 
 from __future__ import annotations
@@ -48,16 +49,16 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 _MAGIC = 0x5053474E
-#: Magic, version, count, degree, fractional bits, flags; in version 4 the number of streams.
+#: Magic, version, count, degree, fractional bits, flags, and in version 4 the number of streams.
 _HEADER = struct.Struct("<IIIBBBB")
 _TABLE_PLACE = struct.Struct("<I12x")  # follows the header in version 4
 _TABLE_ENTRY = struct.Struct("<QQ")  # bytes of a stream, and of its content
 _ANTIALIASED, _EXTENDED = 1, 2  # flags
 _MAX_FRACTION = 23  # bits; one of the 24 is the sign
-_LOG_SCALES = (-10.0, 255 / 16 - 10)  # the least and the largest
-_COLOR_SCALE = 0.15  # band 0 of +-3.3 fits in 8 bits
-_LARGEST_PART = 2**-0.5  # of the three smaller components of a unit quaternion
-_MAX_UNPACKED = 200  # times the size of the file; gzip packs zeros 1000 times smaller
+_LOG_SCALES = (-10.0, 255 / 16 - 10)  # least and largest
+_COLOR_SCALE = 0.15  # 8 bits then represent band 0 in -3.3..3.3
+_LARGEST_PART = 2**-0.5  # limit of the three smaller components of a unit quaternion
+_MAX_UNPACKED = 200  # times the file's size; gzip compresses zeros 1000 times
 _EXTENSION = struct.Struct("<II")  # its type, and the bytes of its content
 _MAX_EXTENSIONS = 1 << 20  # bytes
 _AXES_EXTENSION = 0xADBE0003
@@ -67,15 +68,15 @@ _MOST_AXES = 16
 def write_spz(path: Path, gaussians: Gaussians, *, antialiased: bool = False) -> None:
     """Write Gaussians to a .spz file of version 3, which is replaced atomically.
 
-    What the format can't hold is set to the nearest value that it can, and a warning counts these
-    Gaussians: scales outside e^-10 to e^5.9, colours whose coefficient of band 0 is outside
-    -3.3..3.3, coefficients of bands above 0 outside -1..1, coordinates beyond 8 million. Nothing is
-    turned: the file has the axes of the Gaussians' world.
+    Values outside the format's range are clamped, and a warning counts these Gaussians: scales
+    outside e^-10 to e^5.9, band 0 coefficients outside -3.3..3.3, coefficients of higher bands
+    outside -1..1, coordinates beyond 8 million. The file has the axes of the Gaussians' world,
+    without rotation.
 
     Args:
         path: The file to write.
         gaussians: The Gaussians.
-        antialiased: Whether they are to be rendered with `RasterSettings.antialiased`.
+        antialiased: Whether to render them with `RasterSettings.antialiased`.
 
     Raises:
         XrgsError: A parameter is NaN, or a position, quaternion or coefficient is infinite; the
@@ -103,9 +104,9 @@ def write_spz(path: Path, gaussians: Gaussians, *, antialiased: bool = False) ->
     _warn_of_clipped(
         path,
         {"coordinates": (fixed, -limit, limit)}
-        | {name: (of, -1, 256) for name, of in stored.items()},
+        | {name: (values, -1, 256) for name, values in stored.items()},
     )
-    colors, log_scales, harmonics = (_to_bytes(of).tobytes() for of in stored.values())
+    colors, log_scales, harmonics = (_to_bytes(values).tobytes() for values in stored.values())
     content = [
         _HEADER.pack(_MAGIC, 3, len(means), degree, bits, flags, 0),
         fixed.clip(-limit, limit).astype("<i4").view(np.uint8).reshape(-1, 4)[:, :3].tobytes(),
@@ -122,7 +123,10 @@ def write_spz(path: Path, gaussians: Gaussians, *, antialiased: bool = False) ->
 def _warn_of_clipped(
     path: Path, stored: Mapping[str, tuple[NDArray[np.float64], float, float]]
 ) -> None:
-    """Count the Gaussians [N, ...] of which a value is beyond a least and a largest one."""
+    """Warn with the number of Gaussians that have a value outside the format's range.
+
+    `stored` is name -> (values [N, ...], least, largest).
+    """
     for name, (values, least, most) in stored.items():
         axes = tuple(range(1, values.ndim))
         beyond = ((values < least) | (values > most)).any(axis=axes)
@@ -138,7 +142,7 @@ def _warn_of_clipped(
 
 
 def _fraction_bits(largest: float) -> int:
-    """Return how many of the 24 bits of a coordinate are behind the point."""
+    """Return the number of fractional bits of the 24-bit coordinates, for the largest one."""
     _, exponent = np.frexp(largest)  # the largest is below 2^exponent
     return int(np.clip(_MAX_FRACTION - 1 - exponent, 0, _MAX_FRACTION))
 
@@ -150,7 +154,7 @@ def _to_bytes(values: NDArray[np.float64]) -> Bytes:
 def _packed_quaternions(quats: NDArray[np.float64]) -> NDArray[Any]:
     """Pack unit quaternions [N, 4] wxyz: the index of the largest component, and the other three.
 
-    Each of the three takes 10 bits, of which the highest is the sign. The largest one is positive.
+    Each of the three has 10 bits; the highest is the sign. The largest component is made positive.
     """
     xyzw = quats[:, [1, 2, 3, 0]]
     rows = np.arange(len(xyzw))
@@ -167,11 +171,11 @@ def _packed_quaternions(quats: NDArray[np.float64]) -> NDArray[Any]:
 
 
 def read_spz(path: Path) -> SavedGaussians:
-    """Read the Gaussians of a .spz file of version 2, 3 or 4. Bands above 3 are left out.
+    """Read the Gaussians of a .spz file of version 2, 3 or 4; bands above 3 are left out.
 
     Raises:
-        XrgsError: The file can't be read, is damaged, or of another version; or zstandard, which
-            version 4 needs, is missing. The message names the file.
+        XrgsError: The file can't be read, is damaged or of another version, or is of version 4 and
+            zstandard is not installed. The message names the file.
     """
     try:
         with path.open("rb") as file:
@@ -216,28 +220,28 @@ def _read(path: Path, content: bytes) -> SavedGaussians:
 
 
 def _named_axes(path: Path, extensions: bytes) -> int:
-    """Return the number of the axes that extensions name; 0 where they name none."""
-    axes, at = 0, 0
-    while at + _EXTENSION.size <= len(extensions):
-        kind, length = _EXTENSION.unpack_from(extensions, at)
-        at += _EXTENSION.size + length
-        if at > len(extensions):
+    """Return the number of the axes in the file's extensions; 0 if they name no axes."""
+    axes, offset = 0, 0
+    while offset + _EXTENSION.size <= len(extensions):
+        kind, length = _EXTENSION.unpack_from(extensions, offset)
+        offset += _EXTENSION.size + length
+        if offset > len(extensions):
             raise ValueError("ends within an extension")
         if kind != _AXES_EXTENSION:
             _log.warning("%s: has the extension %#010x, which is not read", path, kind)
             continue
-        axes = int.from_bytes(extensions[at - length : at], "little")
+        axes = int.from_bytes(extensions[offset - length : offset], "little")
         if length != 4 or axes > _MOST_AXES:
             raise ValueError(f"its extension {kind:#x} names axes {axes}, not 0 to {_MOST_AXES}")
     return axes
 
 
 def _to_ply(axes: int) -> NDArray[np.float64]:
-    """Return the matrix [4, 4] from a world of named axes to one of right, down, forward.
+    """Return the matrix [4, 4] from a world with numbered axes to right, down, forward.
 
-    As Niantic's library turns: bits of the number less 1 are whether x points right, y up and z
-    forward, and whether a quarter turn about x is between. From 9 on, the library's names of the
-    axes fit its turns in four of eight cases only; its files are as it turns.
+    As in Niantic's library, the bits of the number minus 1 are: x points right, y up, z forward,
+    and an additional quarter turn about x. From 9 on, the library's names of the axes agree with
+    its rotations in only four of eight cases; the rotations are implemented here.
     """
     bits = axes - 1
     signs = [1 if bits & 1 else -1, -1 if bits & 2 else 1, 1 if bits & 4 else -1, 1]
@@ -248,7 +252,7 @@ def _to_ply(axes: int) -> NDArray[np.float64]:
 
 
 def _streams(path: Path, content: bytes, count: int, size: int) -> Iterator[bytes]:
-    """Yield the content of the streams of version 4, which may be `size` bytes in all."""
+    """Yield the content of the streams of version 4, of at most `size` bytes in total."""
     try:
         import zstandard
     except ImportError as error:
@@ -264,7 +268,7 @@ def _streams(path: Path, content: bytes, count: int, size: int) -> Iterator[byte
         left -= length
         try:
             stream = content[start : start + packed]
-            # The decompressor allocates the size that the stream claims, whatever the limit is.
+            # The decompressor allocates the size that the stream claims, even beyond the limit.
             if zstandard.frame_content_size(stream) > length:
                 raise ValueError("its streams do not fit")
             yield zstandard.ZstdDecompressor().decompress(stream, length)
@@ -274,12 +278,12 @@ def _streams(path: Path, content: bytes, count: int, size: int) -> Iterator[byte
 
 
 def _unpacked(parts: list[Bytes], version: int, fraction: int) -> dict[str, NDArray[Any]]:
-    """Return the parameters by their names."""
+    """Return parameter name -> values."""
     positions, alphas, colors, scales, quats, harmonics = parts
     count = len(alphas)
     wide = np.zeros((count, 3, 4), np.uint8)
     wide[:, :, 1:] = positions.reshape(count, 3, 3)
-    fixed = wide.view("<i4")[..., 0] >> 8  # which extends the sign
+    fixed = wide.view("<i4")[..., 0] >> 8  # the shift extends the sign
     alpha = torch.from_numpy(alphas[:, 0] / 255.0)
     sh = (
         harmonics.reshape(count, harmonics.shape[1] // 3, 3)[:, : bases(MAX_DEGREE) - 1] - 128.0
@@ -311,7 +315,7 @@ def _quaternions(packed: Bytes) -> NDArray[np.float64]:
 
 
 def _small_quaternions(packed: Bytes) -> NDArray[np.float64]:
-    """Unpack quaternions [N, 4] wxyz of version 2: x, y, z in 8 bits each, and w is above 0."""
+    """Unpack quaternions [N, 4] wxyz of version 2: x, y, z have 8 bits each, and w is positive."""
     xyz = packed / 127.5 - 1
     w = np.sqrt((1 - np.square(xyz).sum(axis=1)).clip(0))
     return np.column_stack([w, xyz])

@@ -1,1 +1,1 @@
-"""Makes a frozen mixed-resolution dataset from photographs: a variant."""
+"""Makes a variant from photographs: a frozen mixed-resolution dataset."""

@@ -1,8 +1,9 @@
-"""Estimates how blurry LR photographs are, from spectra alone.
+"""Estimates the blur of LR photographs from power spectra.
 
-Training through a known kernel is wrong for photographs that are blurrier than this kernel makes
-them. Photographs of one scene have about the same power at the same frequency in the scene. So what
-LR photographs have less of it than HR photographs tells their blur, without pairs of photographs.
+Training through a known kernel is wrong if the photographs are blurrier than the kernel.
+Photographs of one scene have about the same power at the same frequency in the scene. So the power
+that LR photographs lack, compared with HR photographs, shows their blur. No pairs of photographs of
+the same view are needed.
 """
 
 from __future__ import annotations
@@ -22,35 +23,36 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-#: The edges of the rings in which power is compared, cycles per LR px. Lower frequencies depend on
-#: what a view shows; higher ones are aliased, noisy, and lost in JPEG. Our choice.
+#: Edges of the frequency rings in which power is compared, cycles per LR px. Lower frequencies
+#: depend on the content of a view; higher ones suffer from aliasing, noise and JPEG. Our choice.
 _RINGS = np.linspace(0.1, 0.3, 9)
-#: The fewest px of a side, at the sampling rate of LR views: each ring then has a frequency in it.
+#: Least side, px at the sampling rate of LR views, at which each ring contains a frequency.
 _LEAST_SIDE = 32
-#: The most views of a class that are read. Our choice.
+#: Largest number of views of each tag that are read. Our choice.
 _MOST_VIEWS = 16
-#: The blur, LR px, above which LR photographs are called blurrier than their pixels. A pixel's box
-#: has sqrt(1 / 12) = 0.29, and LR views of degradation=phone 0.85. Our choice, between the two.
+#: Least sigma, LR px, at which LR photographs are reported as blurrier than their pixels. The box
+#: of a pixel has sqrt(1 / 12) = 0.29, LR views of degradation=phone 0.85. Our choice, in between.
 _BLURRY = 0.5
 _LUMA = np.array([0.299, 0.587, 0.114])
 
 
 def lr_blur(views: Sequence[View]) -> float | None:
-    """Estimate the blur of LR training views: the sigma of a Gaussian that would give it, LR px.
+    """Estimate the blur of LR training views as the sigma of a Gaussian, LR px.
 
     The power P of LR and HR views, in rings of frequencies f in cycles per LR px, is fitted by
 
         log P_LR(f) - log P_HR(f) = c - (2 pi sigma f)^2
 
-    where log P is the mean over views. HR views are read at the same frequencies in the scene, by
-    the median sampling rates of both classes. A pixel's box has a sigma of 0.29. The blur of HR
-    views is subtracted; it is small where they sample the scene much more finely.
+    where log P is the mean over views. HR views are evaluated at the same frequencies in the scene,
+    converted by the median sampling rates of both tags. The box of a pixel has a sigma of 0.29. The
+    result is the blur in excess of that of HR views, which is small if these sample the scene much
+    more finely.
 
     Args:
         views: The views of a variant, with their files.
 
     Returns:
-        sigma, 0 or more; None without views of both classes that are large enough.
+        sigma, 0 or more; None if a tag has no view that is large enough.
     """
     hr, lr = (
         [view for view in views if (view.split, view.tag) == ("train", tag)] for tag in ("HR", "LR")
@@ -70,7 +72,7 @@ def lr_blur(views: Sequence[View]) -> float | None:
 
 
 def blur_notes(blur: float | None) -> list[str]:
-    """Say where LR photographs are blurrier than their pixels, and what learns the blur."""
+    """Return a note if LR photographs are blurrier than their pixels, with a remedy."""
     if blur is None or blur <= _BLURRY:
         return []
     return [
@@ -81,7 +83,7 @@ def blur_notes(blur: float | None) -> list[str]:
 
 
 def _mean_log_power(views: Sequence[View], finer: float) -> Array | None:
-    """Average the `_log_power` of views; None where all of them are too small."""
+    """Average the `_log_power` of views; None if all views are too small."""
     least = _LEAST_SIDE * finer
     usable = [view for view in views if min(view.width, view.height) >= least]
     if not usable:
@@ -96,13 +98,13 @@ def _log_power(view: View, finer: float) -> Array:
 
     Args:
         view: The view.
-        finer: How many times more finely than LR views it samples the scene.
+        finer: Its sampling rate over that of LR views.
     """
     size = view.width, view.height
     pixels = np.asarray(images.read_png_pil(view.file, size))
     mask = None if view.mask is None else images.read_mask(view.mask, size)
     luma = masks.filled(pixels, mask) @ _LUMA
-    # A view ends abruptly at its borders, which a window hides.
+    # A window hides the discontinuity at the borders.
     window = np.outer(np.hanning(view.height), np.hanning(view.width))
     luma = (luma - np.average(luma, weights=window)) * window
     power = np.abs(np.fft.fft2(luma)) ** 2
@@ -110,5 +112,5 @@ def _log_power(view: View, finer: float) -> Array:
     ring = np.digitize(finer * np.hypot(rows[:, None], columns), _RINGS).ravel()
     counts = np.bincount(ring, minlength=len(_RINGS) + 1)[1:-1]
     sums = np.bincount(ring, power.ravel(), minlength=len(_RINGS) + 1)[1:-1]
-    # One step of 8 bits in a view: the logarithm is finite where a view is of one colour.
+    # 1 is the power of a single 8-bit step: it keeps the logarithm finite for a uniform view.
     return np.log(sums / counts + 1.0)

@@ -1,8 +1,8 @@
-"""Writes COLMAP's models with pycolmap; reads and writes points as .ply."""
+"""Writes COLMAP models with pycolmap; reads and writes points as .ply."""
 
 from __future__ import annotations
 
-import zlib  # noqa: F401  pycolmap 4.2.1 corrupts the heap where it is imported before zlib
+import zlib  # noqa: F401  pycolmap 4.2.1 corrupts the heap if it is imported before zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,16 +17,16 @@ from xrgs.safeio import ply
 with handlers_kept():
     import pycolmap
 
-#: The colour of points without one.
+#: Channel value of points without colours.
 GREY = 128
 
 
 @dataclass(frozen=True)
 class PinholeImage:
-    """An image with a pinhole camera of its own, for a model."""
+    """An image of a COLMAP model, with its own pinhole camera."""
 
     name: str
-    """Its path below the folder of images."""
+    """Path of the image, relative to the folder of images."""
     width: int
     height: int
     K: NDArray[np.float64]
@@ -36,13 +36,14 @@ class PinholeImage:
 
 
 def read_points(file: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Read points [P, 3] and their colours [P, 3] from a .ply file; without colours they are grey.
+    """Read points [P, 3] and their colours [P, 3] from a .ply file; missing colours are grey.
 
-    Colours are `red`, `green` and `blue`, or `diffuse_red` and so on: integers of 0 to 255, or of 0
-    to 65535 where they have 16 bits, or floats of 0 to 1, or of 0 to 255 where one is above 1.
+    Colours are `red`, `green` and `blue`, or `diffuse_red` and so on. The range is 0 to 255 for
+    8-bit integers, 0 to 65535 for 16-bit integers, and for floats 0 to 1, or 0 to 255 if a value is
+    above 1.
 
     Raises:
-        XrgsError: The file is no .ply, or its vertices have no x, y and z.
+        XrgsError: The file is not a .ply, or its vertices have no x, y and z.
     """
     vertices = ply.read(file)
     names = [name for name in "xyz" if name not in vertices.names]
@@ -73,13 +74,13 @@ def write_model(
     points: NDArray[np.float64],
     colors: NDArray[np.uint8],
 ) -> None:
-    """Write a binary model of COLMAP without observations.
+    """Write a binary COLMAP model without observations.
 
     Args:
         folder: An existing folder.
-        images: The images; each gets a PINHOLE camera of its own.
+        images: The images; each gets its own PINHOLE camera.
         points: Points [P, 3].
-        colors: Their colours [P, 3].
+        colors: Colours of the points [P, 3].
     """
     model = _with_points(points, colors)
     for number, image in enumerate(images, 1):

@@ -1,7 +1,7 @@
 """Makes the content of a variant: HR and LR views, their poses by SfM, and undistorted images.
 
-COLMAP is re-run on the mixed-resolution images (paper section 4). Where the tags depend on depth,
-they are known only after SfM, which then gets the photographs as they are.
+COLMAP is run anew on the mixed-resolution images (paper, section 4). If the tags depend on depth,
+they are known only after SfM, which then gets the undegraded photographs.
 """
 
 from __future__ import annotations
@@ -43,16 +43,16 @@ if TYPE_CHECKING:
     from xrgs.mixture.sfm import Reconstruction
     from xrgs.photos.scenes import Scene
 
-#: How much finer HR views must sample the scene than LR views for the two to be called so, in their
-#: medians; our choice. The paper has 5.
+#: Least ratio of the median sampling rates of HR and LR views without a note; our choice. The paper
+#: has a ratio of 5.
 _LEAST_RATIO = 1.25
-#: Views are compared at no more points than this, so that a thousand views take little memory.
+#: Largest number of points at which views are compared, to limit the memory for a thousand views.
 _MOST_COMPARED = 10_000
 
 
 @dataclass(frozen=True)
 class _Inputs:
-    """The photographs of a variant, and the class of each."""
+    """The photographs of a variant, and the tag of each."""
 
     scene: Scene
     conf: VariantConf
@@ -61,23 +61,23 @@ class _Inputs:
 
     @property
     def degraded(self) -> tuple[int, ...]:
-        """Indices of the training views that the variant degrades."""
+        """Indices of the training views to degrade."""
         return () if resolve_degradation(self.conf) == "none" else self.split.lr
 
 
 def mix_resolutions(scene: Scene, conf: VariantConf, work: Path, out: Path) -> Variant:
-    """Make the views, poses and points of a variant, whose id is empty.
+    """Make the views, poses and points of a variant; its id is still empty.
 
     Args:
         scene: The photographs.
         conf: The variant's config.
         work: An existing folder for temporary files.
-        out: A folder with an empty folder `images`; it gets `images/<split>/<view>.png` and
+        out: A folder with an empty folder `images`, for `images/<split>/<view>.png` and
             `colmap.log`.
 
     Raises:
         SceneFailed: Too few views are registered.
-        XrgsError: The photographs or the config are not usable; the message names what is wrong.
+        XrgsError: The photographs or the config are not usable; the message says why.
     """
     check_variant_conf(conf)
     start = time.perf_counter()
@@ -111,7 +111,7 @@ def mix_resolutions(scene: Scene, conf: VariantConf, work: Path, out: Path) -> V
 
 
 def _register(inputs: _Inputs, work: Path) -> Registration:
-    """Run SfM, or take the poses that the user gives."""
+    """Run SfM, or read the user's poses."""
     photos, conf = inputs.photos, inputs.conf
     if conf.poses is not None:
         model = poses.read_poses(conf.poses, photos)
@@ -128,7 +128,7 @@ def _register(inputs: _Inputs, work: Path) -> Registration:
 def _split_by_depth(
     photos: PhotoCollection, conf: VariantConf, model: Reconstruction, depths: Mapping[int, float]
 ) -> Split:
-    """Split the views by the scores of `variant.tags`, as far as they are registered."""
+    """Split the views by the scores of `variant.tags`; views without a pose are LR."""
     measures = [
         replace(measured, K=model.lenses[i].undistorted().K, depth=depths.get(i, measured.depth))
         if i in model.lenses
@@ -139,7 +139,7 @@ def _split_by_depth(
 
 
 def _refusal(inputs: _Inputs, model: Reconstruction) -> str:
-    """Say why too few views are registered to train and to test on; empty where they are enough."""
+    """Say why too few views are registered for training and test; empty if they are enough."""
     names, conf = inputs.photos.names, inputs.conf
     missing = [name for i, name in enumerate(names) if i not in model.viewmats]
     source = "" if conf.poses is None else "variant.poses: "
@@ -160,7 +160,7 @@ def _placed(model: Reconstruction, names: Sequence[str]) -> str:
 def _failure(
     inputs: _Inputs, registered: Registration, report: dict[str, Any], work: Path
 ) -> SceneFailed:
-    """Say which photographs are not placed, whether the undegraded ones are, and what to try."""
+    """Describe the failure: photographs that are not placed, SfM without degradation, advice."""
     conf, photos, model = inputs.conf, inputs.photos, registered.model
     said = [registered.refused]
     undegraded = None
@@ -176,7 +176,7 @@ def _failure(
 def _advice(
     inputs: _Inputs, model: Reconstruction, undegraded: Reconstruction | None
 ) -> Iterator[str]:
-    """Yield what may place more photographs, or accept as many as there are."""
+    """Yield settings that may place more photographs, or accept the placed ones."""
     conf, placed = inputs.conf, len(model.viewmats)
     if conf.poses is None:
         if undegraded is not None and len(undegraded.viewmats) > placed and conf.factor > 2:
@@ -198,14 +198,14 @@ def _advice(
 
 
 def _write_log(work: Path, out: Path) -> None:
-    """Join COLMAP's log files; each of them begins with its own name."""
+    """Concatenate COLMAP's log files, whose first lines have their names."""
     files = sorted(work.rglob("colmap-*"))
     text = "".join(file.read_text(encoding="utf-8", errors="replace") for file in files)
     write_text(out / "colmap.log", text)
 
 
 def _sfm_report(inputs: _Inputs, model: Reconstruction) -> dict[str, Any]:
-    """Report the photographs, and how SfM went."""
+    """Report the photographs and the results of SfM."""
     scene, photos = inputs.scene, inputs.photos
     sizes = Counter(f"{photo.hr.width}x{photo.hr.height}" for photo in photos.all)
     return model.report | {
@@ -228,7 +228,7 @@ def _lens_report(photos: PhotoCollection, model: Reconstruction) -> list[dict[st
 
 
 def _pose_report(inputs: _Inputs, registered: Registration, work: Path) -> dict[str, Any]:
-    """Compare the poses with exact ones, or else with SfM of the undegraded photographs."""
+    """Compare the poses with exact ones, or if unknown, with SfM of the undegraded photographs."""
     photos, exact = inputs.photos, inputs.scene.viewmats
     estimated = {photos.names[i]: matrix for i, matrix in registered.model.viewmats.items()}
     if exact:
@@ -254,7 +254,7 @@ def _results(reference: Reconstruction) -> dict[str, Any]:
 
 
 def _tags_report(inputs: _Inputs, views: tuple[View, ...]) -> dict[str, Any]:
-    """Report the class of each view, and minimum, median and maximum of rho per class."""
+    """Report the tag of each view, and minimum, median and maximum of rho for each tag."""
     names, split = inputs.photos.names, inputs.split
     rates = {
         tag: [view.sampling_rate for view in views if (view.split, view.tag) == ("train", tag)]
@@ -280,7 +280,7 @@ def _tags_report(inputs: _Inputs, views: tuple[View, ...]) -> dict[str, Any]:
 
 
 def _class_notes(inputs: _Inputs, rates: Mapping[str, list[float]]) -> list[str]:
-    """Say where photographs that are not degraded differ too little to be told HR and LR."""
+    """Return a note if undegraded HR and LR photographs have nearly the same sampling rate."""
     if inputs.degraded or not rates["HR"] or not rates["LR"]:
         return []
     ratio = float(np.median(rates["HR"]) / np.median(rates["LR"]))
@@ -297,7 +297,7 @@ def _class_notes(inputs: _Inputs, rates: Mapping[str, list[float]]) -> list[str]
 def _with_needs(
     inputs: _Inputs, views: tuple[View, ...], points: sampling_rate.Array
 ) -> tuple[View, ...]:
-    """Return the views with the factors by which they need more px (`View.supersampling`)."""
+    """Return the views with their `View.supersampling`."""
     zooms = resolve_degradation(inputs.conf) == "digital_zoom"
     points = points[:: math.ceil(len(points) / _MOST_COMPARED)]
     rates = []
@@ -306,7 +306,7 @@ def _with_needs(
         used = None if view.mask is None else images.read_mask(view.mask, size)
         at_points = sampling_rate.point_rates(points, view.viewmat, view.K, size, used)
         degraded = view.split == "train" and view.tag == "LR"
-        # A digital zoom resolves fewer px than it has.
+        # The resolution after a digital zoom is lower than the number of px.
         rates.append(at_points / inputs.conf.factor if zooms and degraded else at_points)
     trained = np.array([view.split == "train" for view in views])
     needs = sampling_rate.needed_factors(np.stack(rates), trained)
@@ -314,7 +314,7 @@ def _with_needs(
 
 
 def _need_notes(inputs: _Inputs, views: tuple[View, ...]) -> list[str]:
-    """Say which training views are supersampled, where they are not the degraded ones."""
+    """Return a note on the supersampled training views, unless they are the degraded ones."""
     training = [view for view in views if view.split == "train"]
     larger = [round(view.supersampling) > 1 for view in training]
     if inputs.degraded and larger == [view.tag == "LR" for view in training]:
@@ -328,7 +328,7 @@ def _need_notes(inputs: _Inputs, views: tuple[View, ...]) -> list[str]:
 
 
 def _mask_report(views: tuple[View, ...]) -> dict[str, Any]:
-    """Report the share of the pixels of each class that masks hide."""
+    """Report the fraction of masked pixels for each tag."""
     shares = {}
     for kind, split, tag in (("HR", "train", "HR"), ("LR", "train", "LR"), ("test", "test", "HR")):
         of_kind = [view for view in views if (view.split, view.tag) == (split, tag)]
@@ -350,7 +350,7 @@ def _mask_report(views: tuple[View, ...]) -> dict[str, Any]:
 def _blur_report(conf: VariantConf, views: tuple[View, ...]) -> dict[str, Any]:
     """Report the blur of LR views, and whether they are blurrier than their pixels."""
     blur, degradation = lr_blur(views), DEGRADATIONS.get(resolve_degradation(conf))
-    # A degradation that keeps the size of views takes their detail on purpose.
+    # A degradation that keeps the size of views blurs them on purpose.
     expected = degradation is not None and not degradation.smaller
     return {"lr_blur": blur, "notes": [] if expected else blur_notes(blur)}
 
@@ -358,7 +358,7 @@ def _blur_report(conf: VariantConf, views: tuple[View, ...]) -> dict[str, Any]:
 def _write_undistorted(
     inputs: _Inputs, model: Reconstruction, depths: Mapping[int, float], out: Path
 ) -> tuple[tuple[View, ...], list[str]]:
-    """Undistort every registered view at its own size, and write it; say which are left out."""
+    """Undistort and write every registered view at its size; return views and notes."""
     photos, split = inputs.photos, inputs.split
     degraded, low = set(inputs.degraded), set(split.lr)
     train = [("train", i, "LR" if i in low else "HR") for i in sorted((*split.hr, *split.lr))]

@@ -1,8 +1,8 @@
-"""Finds images that were cropped or zoomed, and so don't share the camera that they are given."""
+"""Finds images that were cropped or zoomed, and so need a camera different from the shared one."""
 
 from __future__ import annotations
 
-import zlib  # noqa: F401  pycolmap 4.2.1 corrupts the heap where it is imported before zlib
+import zlib  # noqa: F401  pycolmap 4.2.1 corrupts the heap if it is imported before zlib
 from collections import Counter
 from collections.abc import Mapping
 from typing import Any
@@ -12,28 +12,28 @@ from xrgs.runtime.signals import handlers_kept
 with handlers_kept():
     import pycolmap
 
-#: Where images with one camera are tried with cameras of their own: the fewest images, the most
-#: iterations, the share of the reprojection error that must remain at most, and the ratio of focal
-#: lengths up to which they are one. Our choice: of fern's 20 photographs each has a focal length
-#: within 0.7 % of the others' then, and the error 0.998 of what it was.
+#: Thresholds for separate cameras: least number of images, iterations of the refinement, largest
+#: ratio of the reprojection errors after and before it, and largest ratio of focal lengths that
+#: count as equal. Our choice: with separate cameras, the focal lengths of fern's 20 photographs
+#: agree to 0.7 %, and the ratio of the errors is 0.998.
 _LEAST_SHARING, _OWN_ITERATIONS, _BETTER, _SAME_FOCAL = 3, 30, 0.97, 1.05
 
 
 def other_cameras(model: Any, cameras: Mapping[str, tuple[int, str]]) -> dict[int, int]:
-    """Find the images that fit better with another camera than the one that they share.
+    """Find the images that fit better with another camera than the shared one.
 
-    Each image gets a camera of its own, and focal lengths, poses and points are refined together.
-    Nothing is found unless the reprojection error falls by 3 %, and the focal lengths of some are
-    then 5 % from those of the others with their camera.
+    Each image gets its own camera, and focal lengths, poses and points are refined together. Images
+    are found if this reduces the reprojection error by at least 3 %, and if their focal lengths
+    then differ by more than 5 % from those of the other images with the shared camera.
 
     Args:
-        model: pycolmap's `Reconstruction`; it stays as it is, but for the errors
-            that it stores with its points.
-        cameras: The index of each image and the name of its camera, by the image's name in the
-            model; images with one name share the camera. Others are left alone.
+        model: pycolmap's `Reconstruction`. Only the errors that it stores with its points change.
+        cameras: Name of an image in the model -> its index and the name of its camera; images with
+            the same camera name share a camera. Other images are ignored.
 
     Returns:
-        A number by the index of each such image; images of one number have one focal length.
+        Index of a found image -> number of its focal length; images with the same number have the
+        same focal length.
     """
     sharing = Counter(camera for _, camera in cameras.values())
     shared = {name for name, (_, camera) in cameras.items() if sharing[camera] >= _LEAST_SHARING}
@@ -58,17 +58,17 @@ def other_cameras(model: Any, cameras: Mapping[str, tuple[int, str]]) -> dict[in
 
 
 def reprojection_error(model: Any) -> float:
-    """Project the points of pycolmap's `Reconstruction`, and return their mean error, px.
+    """Return the mean reprojection error of pycolmap's `Reconstruction`, px.
 
-    Without the update, `compute_mean_reprojection_error` averages the errors that the model stores,
-    which may be from before its last change.
+    The errors are updated first: `compute_mean_reprojection_error` averages stored errors, which
+    may be from before the last change of the model.
     """
     model.update_point_3d_errors()
     return float(model.compute_mean_reprojection_error())
 
 
 def groups_of_focals(focals: Mapping[int, float]) -> list[list[int]]:
-    """Group images by focal length, where a gap of 5 % lies between two groups."""
+    """Group images by focal length, with gaps of more than 5 % between groups."""
     groups: list[list[int]] = []
     before = 0.0
     for index, focal in sorted(focals.items(), key=lambda item: item[1]):
@@ -80,7 +80,7 @@ def groups_of_focals(focals: Mapping[int, float]) -> list[list[int]]:
 
 
 def _with_own_cameras(model: Any) -> Any:
-    """Copy a model, give each image a camera of its own, and refine all but the distortion."""
+    """Copy a model, give each image its own camera, and refine all parameters except distortion."""
     own = pycolmap.Reconstruction()
     for image in model.images.values():
         if not image.has_pose:

@@ -1,11 +1,10 @@
-"""The folders in a store's `variants/`: what their names mean, and the reports of failed scenes.
+"""The folders in a store's `variants/`, by their names, and the reports of failed scenes.
 
-- `<key>-<hash>` is a frozen variant, named by its id, see `xrgs.mixture.saved_variant`.
-- `trimmed-<id>` is a variant without its images, see `xrgs.store.trimming`.
-- `failed-<key>` is of a scene that could not be made into a variant: `report.json` says how SfM
-  went and why the scene failed, and `colmap.log` is COLMAP's log.
-- A name with a dot at its beginning is of work in progress, a lease, or a damaged folder that was
-  set aside.
+- `<key>-<hash>`: a frozen variant, named by its id, see `xrgs.mixture.saved_variant`.
+- `trimmed-<id>`: a variant without its images, see `xrgs.store.trimming`.
+- `failed-<key>`: a scene for which no variant could be made. `report.json` has the results of SfM
+  and the reason, and `colmap.log` is COLMAP's log.
+- Names with a leading dot: work in progress, a lease, or a damaged folder that was set aside.
 """
 
 from __future__ import annotations
@@ -22,8 +21,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 _FAILED, _TRIMMED = "failed-", "trimmed-"
-#: What to try where SfM places too few photographs of a scene. The photographs' own pixels come
-#: first, since they cost nothing but time; fewer views come last.
+#: Advice if SfM places too few photographs of a scene. Using all pixels is first, since it costs
+#: only time; accepting fewer views is last.
 TO_TRY = (
     'What to try where too few photographs are placed, in this order ("When a scene fails" in'
     " docs/your_photographs.md):",
@@ -37,47 +36,47 @@ TO_TRY = (
 
 
 def is_variant(name: str) -> bool:
-    """Return whether a name is of a variant's folder, trimmed or not."""
+    """Return whether a folder with this name is a variant, trimmed or not."""
     return "-" in name and not name.startswith((".", _FAILED)) and is_name(name)
 
 
 def is_trimmed(name: str) -> bool:
-    """Return whether a name is of a trimmed variant's folder."""
+    """Return whether a folder with this name is a trimmed variant."""
     return name.startswith(_TRIMMED)
 
 
 def is_failed(name: str) -> bool:
-    """Return whether a name is of a failed scene's folder."""
+    """Return whether a folder with this name is the report of a failed scene."""
     return name.startswith(_FAILED)
 
 
 def id_of(name: str) -> str:
-    """Return the id of the variant whose folder has this name, trimmed or not."""
+    """Return the variant's id from the name of its folder, trimmed or not."""
     return name.removeprefix(_TRIMMED)
 
 
 def trimmed_folder(variants: Path, variant_id: str) -> Path:
-    """Return the folder that a variant has when it is trimmed; it need not exist."""
+    """Return the folder of a variant after trimming. It may not exist."""
     return variants / f"{_TRIMMED}{variant_id}"
 
 
 def failed_folder(variants: Path, key: str) -> Path:
-    """Return the folder for the report where the scene of a key fails; it need not exist."""
+    """Return the folder for the SfM report of a variant that failed. It may not exist."""
     return variants / f"{_FAILED}{key}"
 
 
 class _FailureReport(Struct):
-    """The part of a failed scene's `report.json` that is read here."""
+    """The fields of a failed scene's `report.json` that this module reads."""
 
     scene: str
     reason: str
 
 
 def read_failure(folder: Path) -> tuple[str, str]:
-    """Return which scene could not be made into a variant, and why.
+    """Read the name of a failed scene, and the reason.
 
     Raises:
-        UnreadableError: The report in the folder can't be read now.
+        UnreadableError: The report in the folder can't be read at the moment.
         StoreError: The report is missing or damaged.
     """
     report = read_struct(folder / "report.json", _FailureReport)
@@ -85,11 +84,11 @@ def read_failure(folder: Path) -> tuple[str, str]:
 
 
 def failed_scenes(variants: Path) -> dict[str, tuple[str, str]]:
-    """List the scenes that could not be made into a variant.
+    """List the failed scenes.
 
     Returns:
-        The scene's name and the reason, by the key of the variant. Where the report can't be read,
-        the scene is `?` and the reason says why.
+        Key of the variant -> name of the scene, and the reason. If a report can't be read, the name
+        is `?` and the reason is the error.
 
     Raises:
         OSError: The folder can't be read; it may be missing.

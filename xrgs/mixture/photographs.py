@@ -1,4 +1,4 @@
-"""Turns a scene's photographs into HR views on disk, and decides which of them share a camera."""
+"""Makes HR views on disk from photographs, and decides which photographs share a camera."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from xrgs.config import VariantConf
     from xrgs.photos.scenes import Scene
 
-#: Photographs without EXIF of a size are taken to be by one camera where so many have a size, on
-#: average. Our choice.
+#: Least average number of photographs for each size at which photographs without EXIF of the same
+#: size are assumed to be from one camera. Our choice.
 _LEAST_OF_SIZE = 5
 
 _Content = TypeVar("_Content")
@@ -39,36 +39,36 @@ class Photograph:
     """A photograph of a scene."""
 
     name: str
-    """The name that its view gets."""
+    """Name of its view."""
     number: str
-    """The name of its copies on disk, because COLMAP need not accept people's file names."""
+    """Name of its copies on disk, since COLMAP may not accept the names of users' files."""
     size: tuple[int, int]
-    """Width and height of the file, with the EXIF orientation applied, px."""
+    """Width and height of the file, after applying the EXIF orientation, px."""
     orientation: int
-    """The EXIF orientation that was applied, 1 to 8; 1 is upright."""
+    """The applied EXIF orientation, 1 to 8; 1 is upright."""
     hr: HrGeometry
-    """The size of its HR view."""
+    """Size and crop of its HR view."""
     sfm: tuple[int, int]
-    """Width and height at which SfM gets the whole photograph, px."""
+    """Width and height of the whole photograph in SfM, px."""
     camera: str
-    """The name of its camera; photographs with one name share the camera in SfM."""
+    """Name of its camera; photographs with the same name share the camera in SfM."""
     K: NDArray[np.float64] | None
-    """Intrinsics [3, 3] of the file, px, where they are known; then there is no distortion."""
+    """Intrinsics [3, 3] of the file, px, if known; then there is no distortion."""
     focal_35mm: float | None
-    """The focal length that EXIF gives, for a film of 36 x 24 mm, mm."""
+    """Focal length from EXIF, mm, equivalent for a film of 36 x 24 mm; None if unknown."""
     path: Path
     """The file."""
 
     @property
     def lens(self) -> Lens | None:
-        """The camera of the file; None where it is not known."""
+        """Camera of the file; None if it is not known."""
         if self.K is None:
             return None
         K = self.K
         return lens_of_model("PINHOLE", self.size, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
 
     def to_hr(self, lens: Lens) -> Lens:
-        """Return the camera of the HR view; `lens` is of the whole photograph, at any size."""
+        """Return the camera of the HR view from that of the whole photograph at any size."""
         return lens.resized(*self.hr.resized).cropped(
             *self.hr.crop_offset, self.hr.width, self.hr.height
         )
@@ -78,21 +78,21 @@ class Photograph:
 class PhotoCollection:
     """The usable photographs of a scene, sorted by name, and their copies in a work folder.
 
-    A copy has one of these kinds:
+    The kinds of copies are
 
-    - `hr` is the HR view, and `lr` the degraded view.
-    - `sfm` is the whole photograph for SfM, and `sfm_lr` is that copy degraded.
-    - `sfm_up` and `sfm_lr_up` are these two resized to `Photograph.sfm`.
-    - `shown`, of photographs with a mask alone, is the HR view with the pixels that the mask hides.
+    - `hr`, the HR view, and `lr`, the degraded view;
+    - `sfm`, the whole photograph for SfM, and `sfm_lr`, the degraded `sfm`;
+    - `sfm_up` and `sfm_lr_up`, `sfm` and `sfm_lr` resized to `Photograph.sfm`;
+    - `shown`, only of photographs with a mask: the HR view including the masked pixels.
 
-    A copy may have a mask. In all kinds but `shown`, pixels that the mask of a photograph hides
-    have the colour of the nearest other one.
+    A copy may have a mask. In all kinds except `shown`, masked pixels have the colour of the
+    nearest used pixel.
     """
 
     all: tuple[Photograph, ...]
     folder: Path
     notes: tuple[str, ...] = ()
-    """Sentences on what was left out, turned, converted and composited."""
+    """Sentences on photographs that were left out, turned, converted or composited."""
 
     def __len__(self) -> int:
         return len(self.all)
@@ -102,11 +102,11 @@ class PhotoCollection:
 
     @property
     def names(self) -> list[str]:
-        """The names of the photographs, in order."""
+        """Names of the photographs, in order."""
         return [photo.name for photo in self.all]
 
     def file(self, kind: str, index: int) -> str:
-        """Return the path of a copy in `folder`; the copy need not exist."""
+        """Return the path of a copy in `folder`; the copy may not exist."""
         return f"{kind}/{self.all[index].number}.png"
 
     def size(self, kind: str, index: int) -> tuple[int, int]:
@@ -118,7 +118,7 @@ class PhotoCollection:
         return images.read(self.folder / self.file(kind, index))
 
     def mask(self, kind: str, index: int) -> Mask | None:
-        """Read the mask of an existing copy, [H, W]; None where all of its pixels are used."""
+        """Read the mask of an existing copy, [H, W]; None if all pixels are used."""
         file = copy_mask(self.folder, self.file(kind, index))
         return images.read_mask(file, self.size(kind, index)) if file.exists() else None
 
@@ -128,7 +128,7 @@ class PhotoCollection:
             images.save_mask(copy_mask(self.folder, self.file(kind, index)), mask, durable=False)
 
     def upsampled(self, kind: str, index: int) -> str:
-        """Resize a copy to `Photograph.sfm`; return the kind of the copy that has this size."""
+        """Resize a copy to `Photograph.sfm` if needed; return the kind of the copy of this size."""
         target, up = self.all[index].sfm, f"{kind}_up"
         if self.size(kind, index) == target:
             return kind
@@ -149,8 +149,8 @@ class PhotoCollection:
             lens: The camera of the copy.
 
         Returns:
-            The image [H, W, 3], not clamped. In an HR view, pixels outside the mask are as in the
-            photograph. The mask [H, W], or None where all pixels are used.
+            The image [H, W, 3], not clamped; an HR view includes the masked pixels of the
+            photograph. The mask [H, W], or None if all pixels are used.
         """
         image, mask = undistort(self.read(kind, index), lens), self.mask(kind, index)
         if mask is None:
@@ -164,22 +164,22 @@ class PhotoCollection:
 def prepare_hr_views(
     scene: Scene, conf: VariantConf, work: Path, *, for_sfm: bool = False
 ) -> PhotoCollection:
-    """Decode every photograph once, and write each that can be used as an HR view.
+    """Decode every photograph once, and write an HR view of each usable photograph.
 
-    All are resized by one factor, so that a camera that resolved more than another still does.
-    Photographs that can't be used are left out, and named in the notes.
+    All photographs are resized by the same factor, which preserves their ratios of resolution.
+    Unusable photographs are left out, and listed in the notes.
 
     Args:
         scene: The scene.
         conf: The variant's config.
         work: An existing folder for the copies.
-        for_sfm: Whether the `sfm` copies are written, too.
+        for_sfm: Whether to write the `sfm` copies too.
 
     Raises:
-        UnreadableError: A photograph can't be read now. It is not left out: the variant would be
-            another one whenever a disk or a server fails.
-        XrgsError: Fewer than two photographs can be used, or one is too large for a variant; the
-            message names the photographs. A mask can't be read, or is of another picture.
+        UnreadableError: A photograph can't be read at the moment. It is not left out, since the
+            variant must not depend on failures of a disk or server.
+        XrgsError: Fewer than two photographs are usable, or one is too large for a variant; the
+            message names the photographs. Or a mask can't be read, or does not fit its photograph.
     """
     (work / MASKS).mkdir(exist_ok=True)
     headers, left_out = _read_headers(scene.files)
@@ -208,14 +208,15 @@ def prepare_hr_views(
 
 
 def expected_photographs(scene: Scene, conf: VariantConf) -> PhotoCollection:
-    """Say from headers alone what `prepare_hr_views` will make, as far as the files can be decoded.
+    """Predict the result of `prepare_hr_views` from the headers of the files.
 
     Returns:
-        The photographs, without copies, and a note on those that will be left out.
+        The photographs, without copies, and a note on those that will be left out. Damage after a
+        header is not noticed.
 
     Raises:
-        UnreadableError: A header can't be read now.
-        XrgsError: As `prepare_hr_views`.
+        UnreadableError: A header can't be read at the moment.
+        XrgsError: As for `prepare_hr_views`.
     """
     headers, left_out = _read_headers(scene.files)
     usable = _usable(scene, conf, headers, left_out, lambda _: None)
@@ -232,9 +233,9 @@ def _usable(
     left_out: dict[str, str],
     read: Callable[[Path], _Content],
 ) -> Iterator[tuple[str, HrGeometry, _Content]]:
-    """Yield name, HR view and content of each photograph that can be used; fill `left_out`."""
+    """Yield name, HR geometry and content of each usable photograph; add others to `left_out`."""
     shrink: float | None = None
-    # Largest first: the first that can be read sets the factor, a damaged file never does.
+    # Largest first, so that the largest readable file, not a damaged one, decides the factor.
     for name in sorted(headers, key=lambda name: max(headers[name].size), reverse=True):
         file, size = scene.files[name], headers[name].size
         try:
@@ -261,7 +262,7 @@ def _photographs(
     left_out: Mapping[str, str],
     geometries: Mapping[str, HrGeometry],
 ) -> tuple[Photograph, ...]:
-    """Describe the photographs that can be used, sorted by name; refuse fewer than two."""
+    """Describe the usable photographs, sorted by name; refuse fewer than two."""
     if len(geometries) < 2:
         count = f"{len(geometries)} photograph(s) can be used, two are needed"
         reasons = f"{scene.name}: {count}: {_reasons(scene, left_out)}"
@@ -287,7 +288,7 @@ def _photographs(
             sfm=_sfm_size(shape, sizes, conf),
             camera=camera,
             K=scene.intrinsics.get(name),
-            # Of a part of the picture, it may be the whole picture's.
+            # The EXIF of a crop may have the focal length of the whole picture.
             focal_35mm=None if of.cut else of.focal_35mm,
             path=scene.files[name],
         )
@@ -296,7 +297,7 @@ def _photographs(
 
 
 def _used(picture: images.Picture, given: Mask | None, scene: Scene) -> Mask | None:
-    """Return which pixels of a photograph are used, by its mask and alpha; None where all are."""
+    """Combine the mask and alpha of a photograph; None if all pixels are used."""
     used = np.ones(picture.pixels.shape[:2], np.bool_) if given is None else given
     if scene.alpha == "mask" and picture.alpha is not None:
         used = used & (picture.alpha >= images.OPAQUE_FROM)
@@ -306,7 +307,7 @@ def _used(picture: images.Picture, given: Mask | None, scene: Scene) -> Mask | N
 def _layers(
     picture: images.Picture, mask: Mask | None, scene: Scene
 ) -> tuple[images.ImageArray, images.ImageArray]:
-    """Return a photograph without the pixels that its mask hides, and as it is shown."""
+    """Return a photograph with masked pixels filled, and the `shown` copy with them."""
     shown = picture.pixels
     if picture.alpha is not None:
         shown = images.composite(shown, picture.alpha, scene.background)
@@ -322,7 +323,7 @@ def _save_hr(
     mask: Mask | None,
     hr: HrGeometry,
 ) -> bool:
-    """Write the HR view of a photograph, with its mask; return whether any pixel is used."""
+    """Write the HR view of a photograph and its mask; return whether any pixel is used."""
     if mask is not None:
         small = _crop(masks.resized(mask, *hr.resized), hr)
         if not small.any():
@@ -347,7 +348,7 @@ def _save_sfm(
 def _notes(
     scene: Scene, left_out: Mapping[str, str], phrases: Mapping[str, Sequence[str]]
 ) -> Iterator[str]:
-    """Yield a sentence on what was left out, and one on each thing that was done."""
+    """Yield a sentence on the photographs left out, and one on each kind of conversion."""
     if left_out:
         yield f"left out: {_reasons(scene, left_out)}"
     for phrase, names in sorted(phrases.items()):
@@ -355,7 +356,7 @@ def _notes(
 
 
 def _reasons(scene: Scene, left_out: Mapping[str, str]) -> str:
-    """Name the photographs that are left out for each reason."""
+    """List the left-out photographs, grouped by reason."""
     names = defaultdict(list)
     for name, why in sorted(left_out.items()):
         names[why].append(_own_name(scene, name))
@@ -367,7 +368,7 @@ def _own_name(scene: Scene, name: str) -> str:
 
 
 def _phrases(picture: images.Picture, scene: Scene) -> Iterator[str]:
-    """Say what was done to a picture."""
+    """Yield a phrase for each conversion of a picture."""
     if picture.orientation > 1:
         yield "turned upright by EXIF"
     yield from picture.notes
@@ -409,7 +410,7 @@ def _crop(image: NDArray[_T], hr: HrGeometry) -> NDArray[_T]:
 def _read_headers(
     files: Mapping[str, Path],
 ) -> tuple[dict[str, images.Header], dict[str, str]]:
-    """Read the header of each file that may be a photograph, and say why each other is none."""
+    """Read the headers: name -> header of a photograph, and name -> why it is not usable."""
     headers: dict[str, images.Header] = {}
     left_out: dict[str, str] = {}
     for name, file in files.items():
@@ -428,9 +429,10 @@ def _read_headers(
 
 
 def largest_of_shape(sizes: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return for each width and height the largest of `sizes` that has its aspect ratio.
+    """Return for each width and height the largest of `sizes` with the same aspect ratio.
 
-    Resized copies round their sides, so that ratios agree where one px explains the difference.
+    Ratios count as equal if rounding a side by one px explains the difference, as in resized
+    copies.
     """
     distinct = sorted(set(sizes), key=math.prod, reverse=True)
 
@@ -443,14 +445,14 @@ def largest_of_shape(sizes: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
 def assign_cameras(
     files: Sequence[Path], sizes: Sequence[tuple[int, int]], policy: str
 ) -> list[str]:
-    """Name the camera of each photograph; photographs with one name share it in SfM.
+    """Name the camera of each photograph; photographs with the same name share it in SfM.
 
     Args:
         files: The photographs.
-        sizes: Their width and height with the EXIF orientation applied, px: a camera held upright
-            is another camera to SfM. All photographs with one name have one aspect ratio.
-        policy: `variant.sfm.camera`: `single` for one camera, `per_image` for one each, `auto` for
-            one per aspect ratio and EXIF camera, digital zoom and crop.
+        sizes: Width and height of each photograph after applying the EXIF orientation, px. A camera
+            has one aspect ratio: held upright, it is a different camera for SfM.
+        policy: `variant.sfm.camera`: `single` for one camera, `per_image` for one for each
+            photograph, `auto` for one for each aspect ratio, EXIF camera, digital zoom and crop.
 
     Raises:
         XrgsError: The policy is `single`, but the aspect ratios differ.
@@ -469,7 +471,7 @@ def assign_cameras(
         return own
     taken = [exif.read(file) for file in files]
     unknown = [size for size, of in zip(sizes, taken, strict=True) if not of.camera]
-    # Two tourists' photographs of one size are a coincidence; a camera takes many of its size.
+    # Equal sizes of few photographs are coincidence, of many they are from the same camera.
     by_size = len(set(sizes)) == 1 or len(unknown) >= _LEAST_OF_SIZE * len(set(unknown))
     names = []
     for i, (size, shape, of) in enumerate(zip(sizes, shapes, taken, strict=True)):
@@ -483,14 +485,14 @@ def assign_cameras(
 def write_degraded(
     photos: PhotoCollection, which: Sequence[int], conf: VariantConf, kind: str = "lr"
 ) -> None:
-    """Degrade views of these indices: the HR views into `lr`, or the `sfm` copies into `sfm_lr`."""
+    """Degrade the views with indices `which`: `hr` into `lr`, or for `sfm_lr`, `sfm` into it."""
     if not which:
         return
     degrade = DEGRADATIONS[resolve_degradation(conf)].function
     for i in progress(which, "LR views", "view"):
         source = "hr" if kind == "lr" else "sfm"
         high, mask = photos.read(source, i), photos.mask(source, i)
-        if kind == "sfm_lr":  # an HR view has been cropped to such a size
+        if kind == "sfm_lr":  # HR views already have such a size
             size = _divisible(*photos.size("sfm", i), conf.factor)
             high, mask = images.resize(high, *size), masks.resized(mask, *size)
         low = degrade(high, conf, _random(photos.names[i], conf))
@@ -499,14 +501,14 @@ def write_degraded(
 
 
 def _random(name: str, conf: VariantConf) -> np.random.Generator:
-    """Return a source of random numbers for a view, whatever the order of the views."""
+    """Return the random generator of a view, which does not depend on the other views."""
     return np.random.default_rng(int(digest([conf.seed, name]), 16))
 
 
 def _divisible(width: int, height: int, factor: int) -> tuple[int, int]:
-    """Return a size with sides that are multiples of `factor`, at most 2% smaller than this one.
+    """Return a size with sides that are multiples of `factor`, at most 2% smaller than the given.
 
-    Of these sizes it has the aspect ratio that is closest to the given one.
+    Among these sizes, it has the aspect ratio closest to the given one.
     """
     most = max(1, width // factor)
     columns = min(

@@ -1,4 +1,4 @@
-"""Measures how far a reconstruction's cameras are from exact ones, up to a similarity."""
+"""Measures the pose errors of a reconstruction against exact cameras, up to a similarity."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ def fit_similarity(source: Matrix, target: Matrix) -> tuple[float, Matrix, Matri
 
 
 def pose_error(estimated: Mapping[str, Matrix], exact: Mapping[str, Matrix]) -> dict[str, float]:
-    """Compare world-to-camera matrices [4, 4] with exact ones, over the names that both have.
+    """Compare world-to-camera matrices [4, 4] with exact matrices of the same names.
 
     Returns:
-        `position_percent` (mean) and `position_percent_max`: distances between camera centres
-        after the best similarity, in % of the largest distance between two exact centres.
-        `rotation_degrees` (mean) and `rotation_degrees_max`: angles after the rotation that all
-        cameras have in common is removed. Positions are left out for fewer than three cameras,
-        which any similarity fits; everything is left out for fewer than two.
+        - `position_percent` (mean) and `position_percent_max`: distances between camera centres
+          after the best similarity, in % of the largest distance between two exact centres. Missing
+          for fewer than three cameras, which a similarity always fits.
+        - `rotation_degrees` (mean) and `rotation_degrees_max`: angles after removing the rotation
+          common to all cameras. Missing for fewer than two cameras.
     """
     names = sorted(estimated.keys() & exact.keys())
     if len(names) < 2:
@@ -50,7 +50,7 @@ def pose_error(estimated: Mapping[str, Matrix], exact: Mapping[str, Matrix]) -> 
     U, _, Vt = np.linalg.svd(rotations.sum(0))
     common = U * np.array([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
     residual = rotations @ common.T
-    # |R - 1|_F = 2 sqrt(2) sin(angle / 2) is exact near 0, where the arccosine of the trace is not.
+    # |R - 1|_F = 2 sqrt(2) sin(angle / 2) is accurate near 0; the arccosine of the trace is not.
     chord = np.linalg.norm(residual - np.eye(3), axis=(1, 2)) / (2 * np.sqrt(2))
     angles = np.degrees(2 * np.arcsin(np.minimum(chord, 1)))
     error = {

@@ -1,8 +1,8 @@
 """Measures how finely each view samples the scene.
 
-The sampling rate nu = focal length (px) / depth is the number of px per scene unit in which a view
-shows the scene. A pixel count stands for the focal length (the paper's Camera Keychain), a distance
-for the depth (its Dining Room).
+The sampling rate nu = focal length (px) / depth is the number of px per world unit at which a view
+shows the scene. Two scenes of the paper use a proxy: Camera Keychain the pixel count for the focal
+length, Dining Room the distance for the depth.
 """
 
 from __future__ import annotations
@@ -23,27 +23,27 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-#: A view that observes fewer points takes the depth of all points inside its image instead.
+#: Least number of observed points for a view's depth; with fewer, all points in its image count.
 _MIN_OBSERVED = 8
-#: The share of the training views that see a point whose rates count as finest there; our choice.
-#: One photograph by a long lens among forty is no reason to render all others larger.
+#: Fraction of the training views at a point that count as the finest there; our choice. So a single
+#: photograph by a long lens among forty does not make all others be rendered larger.
 _FINEST_SHARE = 0.1
 
 
 @dataclass(frozen=True)
 class Measures:
-    """What a tagging policy may score a view by."""
+    """Properties of a view for the scores of tagging policies."""
 
     size: tuple[int, int]
-    """Width and height of the photograph as it was taken, px."""
+    """Width and height of the original photograph, px."""
     K: Array
-    """Intrinsics [3, 3] of the undistorted HR view, px; NaN where they are not known."""
+    """Intrinsics [3, 3] of the undistorted HR view, px; NaN if unknown."""
     depth: float
-    """Median depth of the view's points, in world units; NaN where it is not known."""
+    """Median depth of the view's points, world units; NaN if unknown."""
 
 
 def not_placed(size: tuple[int, int]) -> Measures:
-    """Return the measures of a view without a camera, of which the size alone is known."""
+    """Return the measures of a view without a camera: only the size is known."""
     return Measures(size, np.full((3, 3), np.nan), float("nan"))
 
 
@@ -55,13 +55,13 @@ def median_depth(
     Args:
         points: SfM points [P, 3].
         viewmat: World to camera [4, 4].
-        lens: The view's camera; the undistorted image is the one that counts.
-        observed: Indices of the points that SfM found in the view. Points behind the camera do not
-            count. Where fewer than 8 are left, all points in front of the camera that project into
-            its image are taken instead.
+        lens: The view's camera, whose undistorted image is tested.
+        observed: Indices of the points that SfM observed in the view. Those behind the camera are
+            ignored. If fewer than 8 remain, all points in front of the camera that project into the
+            image are used instead.
 
     Returns:
-        The depth along the optical axis, in world units; NaN without a point.
+        The depth along the optical axis, world units; NaN without points.
     """
     camera = points @ viewmat[:3, :3].T + viewmat[:3, 3]  # [P, 3]
     depth = camera[:, 2]
@@ -77,9 +77,9 @@ def median_depth(
 
 
 def median_depths(model: Reconstruction) -> dict[int, float]:
-    """Return the `median_depth` of every registered view, by index.
+    """Return index -> `median_depth`, of every registered view.
 
-    A view that observes no point gets the median of the others.
+    Views without points get the median of the other views.
 
     Raises:
         XrgsError: No view observes a point.
@@ -101,14 +101,14 @@ def sampling_rate(K: Array, depth: float) -> float:
     """Return the sampling rate nu, px per world unit.
 
     Args:
-        K: Intrinsics [3, 3], px. The geometric mean of both axes' focal lengths is taken.
-        depth: The median depth, in world units.
+        K: Intrinsics [3, 3], px. The focal length is the geometric mean over both axes.
+        depth: The median depth, world units.
     """
     return float(np.sqrt(K[0, 0] * K[1, 1]) / depth)
 
 
 def relative_to_largest(values: Sequence[float]) -> list[float]:
-    """Divide positive numbers by the largest of them; NaN stays NaN."""
+    """Divide positive numbers by the largest number; NaN stays NaN."""
     largest = np.nanmax(values)
     return [float(value / largest) for value in values]
 
@@ -118,18 +118,18 @@ def point_rates(
 ) -> Array:
     """Compute the sampling rate of a view at each point, px per world unit.
 
-    A view sees a point that is in front of the camera and inside the image, at a pixel that the
-    mask uses. Other points that may hide it are not known.
+    A view sees a point if it is in front of the camera and projects into the image, to a used
+    pixel. Occlusion is ignored.
 
     Args:
         points: [P, 3] in world units.
         viewmat: World to camera [4, 4].
         K: Intrinsics [3, 3], px.
         size: Width and height of the image, px.
-        used: The view's mask [H, W], True for a pixel that is used; None uses all.
+        used: The view's mask [H, W], True for a used pixel; None uses all.
 
     Returns:
-        [P] sqrt(fx fy) / z at depth z; 0 where the view does not see the point.
+        [P] sqrt(fx fy) / z at depth z; 0 if the view does not see the point.
     """
     camera = points @ viewmat[:3, :3].T + viewmat[:3, 3]  # [P, 3]
     rates = np.zeros(len(points))
@@ -146,22 +146,22 @@ def point_rates(
 
 
 def needed_factors(rates: Array, trained: Mask) -> list[float]:
-    """Compute how many times as many px a side each view needs to be as fine as the finest views.
+    """Compute the factor of width and height at which each view would be as fine as the finest.
 
     With r_v(p) the rate of view v at point p,
 
         need_v = median over the points p that v sees of r*(p) / r_v(p),
 
-    where r*(p) is a rate that a tenth of the training views that see p reach, and at least one of
-    them. Our choice: the whole measure. The maximum in place of that rate would let a single
-    close-up of a large scene decide for all other views.
+    where r*(p) is the rate that a tenth of the training views that see p reach or exceed, at least
+    one view. Our choice: the whole measure. With the maximum instead, a single close-up of a large
+    scene would decide for all other views.
 
     Args:
         rates: `point_rates` [V, P] of all views at the same points.
-        trained: [V], True for a training view.
+        trained: [V] bool, True for a training view.
 
     Returns:
-        The factor of each view; 1 for a view that sees no point that a training view sees.
+        The factor of each view; 1 for a view that shares no point with a training view.
     """
     descending = -np.sort(-rates[trained], axis=0)
     rank = np.ceil(_FINEST_SHARE * (descending > 0).sum(axis=0)).astype(np.intp) - 1

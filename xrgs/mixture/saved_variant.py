@@ -1,10 +1,10 @@
-"""Writes, verifies and reads the folder of a frozen variant. Nothing here imports torch.
+"""Writes, verifies and reads the folder of a frozen variant, without importing torch.
 
-The folder is named by the variant's id. `variant.json` (`Manifest`) lists the views and the hash
-of every other file that decides a number: `images/<split>/<view>.png`, the masks
-`images/<split>-masks/<view>.png` of the views that have one, and `points.npz`, the SfM points and,
-where poses were given, the transform from their world.
-`report.json` says how SfM went, and `colmap.log` is COLMAP's log.
+The name of the folder is the variant's id. `variant.json` (`Manifest`) lists the views and the
+hashes of the other files that affect training: `images/<split>/<view>.png`,
+`images/<split>-masks/<view>.png` for views with a mask, and `points.npz` with the SfM points and,
+for given poses, the transform from their world. `report.json` has the results of SfM, and
+`colmap.log` is COLMAP's log.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 MANIFEST, POINTS, REPORT, LOG = "variant.json", "points.npz", "report.json", "colmap.log"
-#: The fewest points: a Gaussian's first size is the distance of a point to its three nearest.
+#: Least number of points, since the initial scale of a Gaussian needs its three nearest points.
 _MIN_POINTS = 4
-#: The largest coordinate of a point. Training computes with its square in float32.
+#: Largest coordinate of a point, whose square must fit in float32.
 _MAX_COORDINATE = 1e12
 
 _Side = Annotated[int, Meta(ge=1, le=1 << 16)]
@@ -67,13 +67,13 @@ class Manifest(Struct, frozen=True, forbid_unknown_fields=True):
     held_out: bool
     views: Annotated[tuple[ViewEntry, ...], Meta(min_length=1)]
     files: dict[str, str]
-    """The SHA-256 of each file by its path in the folder, with `/`."""
+    """Path of a file in the folder, with `/` -> its SHA-256."""
     id: str = ""
     code: dict[str, str] = {}
-    """The digest of each part of the code that made the variant; empty in older variants."""
+    """Part of the code that made the variant -> its digest; empty in older variants."""
 
     def computed_id(self) -> str:
-        """Return the key, then a hash of all else that decides a number."""
+        """Return the id: the key, then a hash of the content that affects training."""
         content = msgspec.to_builtins(self)
         hashed = {k: v for k, v in content.items() if k not in ("id", "scene", "code")}
         return f"{self.key}-{digest(hashed)}"
@@ -84,19 +84,19 @@ class CorruptVariant(XrgsError):  # noqa: N818
 
 
 def freeze(made: Variant, key: str, folder: Path, variants: Path, code: dict[str, str]) -> Variant:
-    """Write a variant's fields into the folder of its images, and rename the folder to its id.
+    """Write a variant's data into the folder of its images, and rename the folder to its id.
 
-    All files are on the disk before the folder has its name.
+    All files are synced to the disk before the folder is renamed.
 
     Args:
-        made: The variant; its id is not read.
-        key: The key of what it was made from.
-        folder: The folder of its images, on the disk of `variants`.
-        variants: The folder that the variant will be in.
-        code: The digest of each part of the code that made it.
+        made: The variant; its id is ignored.
+        key: The variant's key (`xrgs.mixture.variant.key`).
+        folder: The folder of its images, on the same disk as `variants`.
+        variants: The parent of the final folder.
+        code: Part of the code that made the variant -> its digest.
 
     Returns:
-        The variant, as it is read from its new place.
+        The variant, loaded from its final folder.
     """
     with atomic_writer(folder / POINTS, durable=False) as stream:
         if np.array_equal(made.world, np.eye(4)):
@@ -124,10 +124,10 @@ def freeze(made: Variant, key: str, folder: Path, variants: Path, code: dict[str
 
 
 def load(folder: Path) -> Variant:
-    """Load a frozen variant, after every hash is verified.
+    """Verify all hashes of a frozen variant, and load it.
 
     Raises:
-        UnreadableError: A file can't be read now; nothing is known of the variant.
+        UnreadableError: A file can't be read at the moment; the variant may be intact.
         CorruptVariant: A file is missing or has changed, or the folder's name is not the variant's
             id.
     """
@@ -157,8 +157,8 @@ def read_manifest(folder: Path) -> Manifest:
     """Read and check `variant.json`.
 
     Raises:
-        UnreadableError: The file can't be read now.
-        StoreError: The file is missing or damaged, or the folder's name is not its id.
+        UnreadableError: The file can't be read at the moment.
+        StoreError: The file is missing or damaged, or the folder's name is not the id.
     """
     file = folder / MANIFEST
     manifest = read_struct(file, Manifest)
@@ -171,7 +171,7 @@ def read_manifest(folder: Path) -> Manifest:
         raise StoreError(f"damaged: {file}: files: they are not the views' files and {POINTS}")
     if missing := {"train", "test"} - {view.split for view in manifest.views}:
         raise StoreError(f"damaged: {file}: views: none is to {min(missing)}")
-    # A user may name the folder by a link or by `.`; a trimmed one has a prefix.
+    # The path may be a link or `.`; the folder of a trimmed variant has a prefix.
     names_of_folder = (folder.name, folder.resolve().name)
     if not any(name.endswith(manifest.id) for name in names_of_folder):
         raise StoreError(f"{folder}: this folder has another name than its variant {manifest.id}")
@@ -190,7 +190,7 @@ def _errors_as_corrupt() -> Iterator[None]:
 
 
 def _assembled(folder: Path, manifest: Manifest) -> Variant:
-    """Read points and report, and make the variant."""
+    """Read points and report, and build the variant."""
     file = folder / POINTS
     try:
         with errors_named(file), file.open("rb") as stream:
@@ -230,7 +230,7 @@ def _assembled(folder: Path, manifest: Manifest) -> Variant:
 
 
 def _pictures(views: Iterable[ViewEntry]) -> list[str]:
-    """Return the images and masks of views by their paths in the folder, sorted."""
+    """Return the sorted paths of the views' images and masks in the folder."""
     return sorted({name for view in views for name in (view.file, view.mask) if name is not None})
 
 

@@ -1,12 +1,12 @@
-"""Runs structure from motion with pycolmap: finds the cameras and points of a set of images.
+"""Runs structure from motion with pycolmap to find the cameras and points of a set of images.
 
-COLMAP's own log goes to files in the work folder; the user sees one progress bar per stage.
+COLMAP's log goes to files in the work folder; the user sees a progress bar for each stage.
 """
 
 from __future__ import annotations
 
 import tempfile
-import zlib  # noqa: F401  pycolmap 4.2.1 corrupts the heap where it is imported before zlib
+import zlib  # noqa: F401  pycolmap 4.2.1 corrupts the heap if it is imported before zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -30,16 +30,17 @@ if TYPE_CHECKING:
 with handlers_kept():
     import pycolmap
 
-#: The number of features in all images with which exhaustive matching takes minutes on two cores.
+#: Number of features of all images together with which exhaustive matching takes minutes on two
+#: cores.
 _TOTAL_FEATURES = 100_000
-#: COLMAP's own default of `max_num_features`, per image.
+#: COLMAP's default of `max_num_features`, for each image.
 _MAX_FEATURES = 8192
-#: The longer side, px, up to which features are detected at twice the resolution: half of the
-#: default of `variant.sfm.long_side`, so that SIFT takes no longer than at that size.
+#: Largest longer side at which features are detected at twice the resolution, px: half the default
+#: of `variant.sfm.long_side`, so that SIFT takes no longer than at that size.
 _SMALL_SIDE = 800
-#: The smallest triangulation angle for two views of a narrow baseline, degrees.
+#: Least triangulation angle for two images, which may have a narrow baseline, degrees.
 _TWO_VIEW_ANGLE = 0.2
-#: The inliers of the first pair over the inliers of a later view: COLMAP's defaults of
+#: Ratio of the least inliers of the first pair and of a later view: COLMAP's defaults of
 #: `init_min_num_inliers` and `abs_pose_min_num_inliers`.
 _FIRST_PAIR_RATIO = 100 / 30
 #: The entries of K that are the parameters of COLMAP's PINHOLE camera.
@@ -48,65 +49,64 @@ _PINHOLE_ENTRIES = ((0, 0), (1, 1), (0, 2), (1, 2))
 
 @dataclass(frozen=True)
 class SfmImage:
-    """One image that SfM is to register."""
+    """An image for SfM."""
 
     file: str
-    """Its path, relative to the folder of all images."""
+    """Path of the image, relative to the folder of all images."""
     name: str
-    """The photograph's name, for messages."""
+    """Name of the photograph, for messages."""
     camera: str
-    """The name of its camera; images with one name share the camera."""
+    """Name of the camera; images with the same name share the camera."""
     K: NDArray[np.float64] | None = None
-    """Intrinsics [3, 3], px, where they are known: then there is no distortion, and they are not
-    refined."""
+    """Intrinsics [3, 3], px, if known. They are not refined, and there is no distortion."""
     focal: float | None = None
-    """The focal length that EXIF gives, px: refinement begins with it."""
+    """Focal length from EXIF, px, the initial value of the refinement; None if unknown."""
     masked: bool = False
-    """Whether it has a mask, `xrgs.photos.masks.copy_mask` of its file: no features outside."""
+    """Whether a mask (`xrgs.photos.masks.copy_mask` of the file) restricts the features."""
 
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """COLMAP's largest model, empty where there is none; keys are indices of the images."""
+    """COLMAP's largest model; empty if there is none. Keys are indices of images."""
 
     lenses: dict[int, Lens]
-    """The camera of each registered image, in that image's px."""
+    """Registered image -> its camera, in px of the image."""
     viewmats: dict[int, NDArray[np.float64]]
-    """World to camera [4, 4], OpenCV axes."""
+    """Registered image -> world to camera [4, 4], OpenCV axes."""
     points: NDArray[np.float64]
     """SfM points [P, 3]."""
     colors: NDArray[np.uint8]
-    """Their colours [P, 3]."""
+    """Colours of the points [P, 3]."""
     observed: dict[int, NDArray[np.intp]]
-    """Indices of the points that were found in each image, ascending."""
+    """Registered image -> ascending indices of its observed points."""
     report: dict[str, Any]
-    """Settings and results, by the keys that the variant's report has."""
+    """Settings and results, with the keys of the variant's report."""
     world: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
-    """The rigid transform [4, 4] from the world of given poses to this one."""
+    """The rigid transform [4, 4] from the world of given poses to the world of `viewmats`."""
     apart: Mapping[int, int] = field(default_factory=dict)
-    """The images that fit better with another camera than the one that they share, as
-    `xrgs.mixture.own_cameras` numbers them."""
+    """Image that fits better with another camera than the shared one -> number of that camera
+    (`xrgs.mixture.own_cameras`)."""
 
 
 def features_per_image(images: int, configured: int) -> int:
-    """Return `variant.sfm.max_num_features`; where it is 0, choose the features of one image.
+    """Return `variant.sfm.max_num_features`; if it is 0, choose a number of features per image.
 
-    The choice keeps exhaustive matching short, and is at most COLMAP's 8192.
+    The choice keeps exhaustive matching short, and is at most COLMAP's default of 8192.
     """
     return configured or min(_MAX_FEATURES, _TOTAL_FEATURES // max(images, 1))
 
 
 def first_octave(long_side: int, configured: int | None) -> int:
-    """Return `variant.sfm.first_octave`; where it is None, choose it: -1 up to 800 px, 0 above.
+    """Return `variant.sfm.first_octave`; if it is None, choose -1 up to 800 px and 0 above.
 
-    -1 detects features at twice the resolution. For small images it is better. On the embedded
-    scene with mixed resolution it gave 1.7 to 2 times the points and 3 to 21% less position error,
-    at 250 px and at 500 px. Of 37 photographs of bonsai (Mip-NeRF 360) at 800 px, LR ones at 160,
-    it placed 18 instead of 3.
+    -1 detects features at twice the resolution, which is better for small images. On the embedded
+    scene with mixed resolution, at 250 px and at 500 px, it gave 1.7 to 2 times as many points and
+    3 to 21% less position error. For 37 photographs of bonsai (Mip-NeRF 360), HR at 800 px and LR
+    at 160 px, it placed 18 instead of 3.
 
     Args:
         long_side: The longest side of all images, px.
-        configured: The value of the key.
+        configured: The value of `variant.sfm.first_octave`.
     """
     if configured is not None:
         return configured
@@ -118,20 +118,20 @@ def reconstruct(
 ) -> Reconstruction:
     """Find cameras and points by exhaustive matching and incremental mapping.
 
-    With any number of threads, images have the same numbers and RANSAC makes the same draws. Some
-    90 runs with 1 and 3 threads on one kind of processor gave the same bits. One other run did not:
-    its focal length differed by 1/100,000, for a reason inside COLMAP that was not found. Another
-    kind of processor may give other last digits.
+    For any number of threads, images have the same ids and RANSAC the same random numbers. About 90
+    runs with 1 and 3 threads on the same kind of processor gave the same bits. In one other run the
+    focal length differed by 1/100,000, for an unknown reason inside COLMAP. On another kind of
+    processor, last digits may differ.
 
     Args:
-        sfm_images: The images; those without `K` get one SIMPLE_RADIAL camera per `camera` name.
+        sfm_images: The images; those without `K` get a SIMPLE_RADIAL camera for each `camera` name.
         folder: The folder that `SfmImage.file` is relative to.
         work: An existing folder for COLMAP's database, models and logs. Features and matches of
             an earlier call with the same images, `max_num_features` and `first_octave` are reused.
         conf: The settings.
 
     Returns:
-        The largest model; empty where COLMAP found none.
+        The largest model; empty if COLMAP found none.
     """
     _log_to(work)
     pycolmap.set_random_seed(conf.seed)
@@ -179,11 +179,11 @@ def triangulate(
     work: Path,
     conf: SfmConf,
 ) -> Reconstruction:
-    """Find the points that images of known cameras and poses show, by exhaustive matching.
+    """Triangulate points from images with known cameras and poses, by exhaustive matching.
 
     Args:
-        sfm_images: The images, each with `K` and a camera of its own.
-        viewmats: World to camera [4, 4] of each.
+        sfm_images: The images, each with `K` and its own camera.
+        viewmats: World to camera [4, 4] of each image.
         folder: The folder that `SfmImage.file` is relative to.
         work: An existing folder for COLMAP's database and logs.
         conf: The settings.
@@ -208,7 +208,7 @@ def triangulate(
 def _find_matches(
     sfm_images: Sequence[SfmImage], folder: Path, work: Path, conf: SfmConf
 ) -> dict[str, Any]:
-    """Fill the database in `work`, unless an earlier call has; return the settings of SIFT."""
+    """Fill the database in `work` unless it is already filled; return the settings of SIFT."""
     database = work / "database.db"
     max_features = features_per_image(len(sfm_images), conf.max_num_features)
     longest = max(max(images.size(folder / image.file)) for image in sfm_images)
@@ -221,17 +221,17 @@ def _find_matches(
 
 
 def bogus_cameras(model: Any, sfm_images: Sequence[SfmImage]) -> dict[int, str]:
-    """Find images whose camera is impossible, by COLMAP's own limits for its parameters.
+    """Find images with an impossible camera, by COLMAP's limits for the parameters.
 
-    COLMAP drops such images after every bundle adjustment but the last, so that a model may end
-    with a focal length below 0.
+    COLMAP drops such images after every bundle adjustment except the last, so that the final model
+    may contain a negative focal length.
 
     Args:
         model: pycolmap's `Reconstruction`.
-        sfm_images: The images; the intrinsics of those with `K` are known, and are not judged.
+        sfm_images: The images; those with `K` are not checked.
 
     Returns:
-        The parameters of the camera by the index of each such image.
+        Index of an image with an impossible camera -> the camera's parameters.
     """
     limits = pycolmap.IncrementalMapperOptions()
     refined = {image.file: i for i, image in enumerate(sfm_images) if image.K is None}
@@ -250,7 +250,7 @@ def bogus_cameras(model: Any, sfm_images: Sequence[SfmImage]) -> dict[int, str]:
 
 
 def _log_to(work: Path) -> None:
-    """Send COLMAP's log to files in `work`, and not to the terminal."""
+    """Redirect COLMAP's log from the terminal to files in `work`."""
     log = pycolmap.logging
     log.logtostderr = log.alsologtostderr = False
     log.stderrthreshold = int(log.FATAL.value)
@@ -259,10 +259,10 @@ def _log_to(work: Path) -> None:
 
 
 def _name_cameras(sfm_images: Sequence[SfmImage], folder: Path, database: Path) -> None:
-    """Write images and cameras into a new database, in the order in which they are given.
+    """Write images and cameras into a new database, in the given order.
 
-    Several threads that extract features would number images as they finish, and the numbers
-    decide the order of everything that follows.
+    Otherwise the threads that extract features would number images in the order they finish, and
+    the ids decide the order of all later stages.
     """
     with pycolmap.Database.open(database):
         pass
@@ -302,7 +302,7 @@ def _extract(
     with ProgressBar("SfM: features", "view", len(sfm_images)) as bar:
         for batch in _batches(sfm_images, 2 * threads):
             reader = pycolmap.ImageReaderOptions()
-            if batch[0].masked:  # COLMAP drops an image whose mask it does not find
+            if batch[0].masked:  # COLMAP skips images without a mask file
                 reader.mask_path = folder / MASKS
             pycolmap.extract_features(
                 database,
@@ -316,9 +316,9 @@ def _extract(
 
 
 def _batches(sfm_images: Sequence[SfmImage], size: int) -> Iterator[list[SfmImage]]:
-    """Yield images a few at a time, so that progress can be shown in between.
+    """Yield images in batches of at most `size`, so that progress can be shown in between.
 
-    Either all or none of them have masks.
+    In a batch, all images have masks or none has.
     """
     for masked in (False, True):
         group = [image for image in sfm_images if image.masked == masked]
@@ -327,11 +327,11 @@ def _batches(sfm_images: Sequence[SfmImage], size: int) -> Iterator[list[SfmImag
 
 
 def _match(sfm_images: Sequence[SfmImage], database: Path, work: Path, seed: int) -> None:
-    """Match every pair of images: one image at a time with all that come before it."""
+    """Match every pair of images: each image with all images before it."""
     matching = pycolmap.FeatureMatchingOptions()
     matching.num_threads = usable_cores()
     verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = seed  # for each pair, whichever thread verifies it
+    verification.ransac.random_seed = seed  # of each pair, on any thread
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = work / "pairs.txt"
     pairs = len(sfm_images) * (len(sfm_images) - 1) // 2
@@ -371,17 +371,17 @@ def mapping_options(conf: SfmConf, count: int, *, known: bool) -> Any:
     Args:
         conf: The settings.
         count: The number of images. With two, COLMAP's defaults would drop every point.
-        known: Whether the intrinsics of all images are known; they are then not refined.
+        known: Whether the intrinsics of all images are known and not to be refined.
     """
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = conf.seed
-    options.num_threads = 1  # several threads sum a bundle adjustment in another order each time
+    options.num_threads = 1  # the order of sums would vary with several threads
     options.mapper.init_min_tri_angle = conf.init_min_tri_angle
     options.mapper.abs_pose_min_num_inliers = conf.min_inliers
     options.mapper.init_min_num_inliers = round(conf.min_inliers * _FIRST_PAIR_RATIO)
     options.min_model_size = min(count, options.min_model_size)
     if count == 2:
-        # By default a point that only two images observe is dropped, which is every one here.
+        # By default COLMAP drops points that only two images observe: here, all points.
         options.triangulation.ignore_two_view_tracks = False
         options.triangulation.min_angle = _TWO_VIEW_ANGLE
         options.mapper.filter_min_tri_angle = _TWO_VIEW_ANGLE
@@ -396,12 +396,12 @@ def mapping_options(conf: SfmConf, count: int, *, known: bool) -> Any:
 
 
 def to_numpy(model: Any, index: Mapping[str, int], report: Mapping[str, Any]) -> Reconstruction:
-    """Convert pycolmap's `Reconstruction` into numpy arrays, the points in the order of their ids.
+    """Convert pycolmap's `Reconstruction` into numpy arrays, with points in the order of their ids.
 
     Args:
         model: The model.
-        index: The index of each image by its name in the model; other images are left out.
-        report: What is reported beside the results.
+        index: Name of an image in the model -> its index; other images are left out.
+        report: Entries of the report besides the results.
 
     Raises:
         XrgsError: A camera model is not supported.
@@ -421,13 +421,13 @@ def to_numpy(model: Any, index: Mapping[str, int], report: Mapping[str, Any]) ->
         observed[i] = np.array(sorted(own), dtype=np.intp)
     points, colors = points_of(model)
     results: dict[str, Any] = {"registered": len(viewmats), "points": len(points)}
-    if model.compute_num_observations():  # a model of another program may have none
+    if model.compute_num_observations():  # models of other programs may have no observations
         results["reprojection_error_px"] = reprojection_error(model)
     return Reconstruction(lenses, viewmats, points, colors, observed, {**report, **results})
 
 
 def points_of(model: Any) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Return the points [P, 3] of pycolmap's `Reconstruction` by id, and their colours [P, 3]."""
+    """Return points [P, 3] and colours [P, 3] of pycolmap's `Reconstruction`, sorted by id."""
     order = sorted(model.points3D)
     points = np.array([model.points3D[p].xyz for p in order], dtype=np.float64).reshape(-1, 3)
     colors = np.array([model.points3D[p].color for p in order], dtype=np.uint8).reshape(-1, 3)

@@ -1,19 +1,19 @@
-"""Registers the views of a mixed-resolution scene, with further attempts where too few register.
+"""Registers the views of a mixed-resolution scene by SfM, with further attempts if that fails.
 
-SfM gets whole photographs at `sfm.long_side`, whatever the size that is trained. Photographs that
-the variant degrades are degraded at that size. With `sfm.lr_images: upsampled`, a smaller image is
-resized to the size of the largest of its shape, and one camera serves both. This makes the poses
-of small images several times more accurate. With `native`, SfM gets a smaller image as it is, with
-a camera of its size.
+SfM gets whole photographs at `sfm.long_side`, independent of the size of HR views. Photographs that
+the variant degrades are degraded at that size. With `sfm.lr_images: upsampled`, smaller images are
+resized to the size of the largest image of the same aspect ratio, and share its camera. This makes
+their poses several times more accurate. With `native`, smaller images keep their size, and have a
+camera of that size.
 
 The first attempt, `configured`, has the settings of `variant.sfm`. With `sfm.fallbacks`, the
-attempts of `FALLBACKS` follow in their order until a reconstruction is accepted. The first of them
-also follows where a reconstruction is accepted that lacks views. Where EXIF gives a focal length,
-which is the first guess of the others, an attempt without it comes second of them.
+attempts of `FALLBACKS` follow in order until a reconstruction is accepted. The first of these is
+also made if `configured` is accepted but lacks views. If EXIF gives a focal length, which the other
+attempts use as the initial value, an attempt without it is made after the first fallback.
 
-Photographs that were cropped or zoomed may keep their EXIF, and share a camera with the others. The
-best reconstruction is tried for this: where views fit better with a camera of their own
-(`xrgs.mixture.own_cameras`), the attempt `cameras_apart` gives them one.
+Photographs that were cropped or zoomed may keep their EXIF, and so share a camera with the others.
+If views of the best reconstruction fit better with another camera (`xrgs.mixture.own_cameras`), the
+attempt `cameras_apart` gives them one.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-#: The fewest inliers that COLMAP itself accepts for an absolute pose.
+#: COLMAP's lower limit of inliers for an absolute pose.
 _MIN_INLIERS = 6
-#: The diagonal of 35 mm film, mm: CIPA defines equal focal lengths by it.
+#: Diagonal of 35 mm film, mm, by which CIPA defines 35 mm equivalent focal lengths.
 _FILM_DIAGONAL = math.hypot(36, 24)
-#: The report's values that are kept for each attempt.
+#: Keys of SfM's report that are stored for each attempt.
 _ATTEMPT_KEYS = (
     "lr_images",
     "first_octave",
@@ -57,56 +57,56 @@ _ATTEMPT_KEYS = (
 
 @dataclass(frozen=True)
 class Attempt:
-    """One way to run SfM."""
+    """The settings of one run of SfM."""
 
     name: str
     conf: SfmConf
     uses_exif: bool = True
-    """Whether refinement begins with the focal lengths that EXIF gives."""
+    """Whether EXIF's focal lengths are the initial values of the refinement."""
     apart: Mapping[int, int] = field(default_factory=dict)
-    """The views that don't share the camera of their name; those of one number share one."""
+    """View that does not use the camera of its name -> number of its camera."""
 
 
 def relaxed(conf: SfmConf, images: int, *, any_smaller: bool) -> Attempt:  # noqa: ARG001
-    """Accept half of the inliers per view; features and matches stay, so that it is quick."""
+    """Halve the required inliers per view; features and matches are reused, so it is quick."""
     return Attempt("relaxed", replace(conf, min_inliers=max(_MIN_INLIERS, conf.min_inliers // 2)))
 
 
 def finer(conf: SfmConf, images: int, *, any_smaller: bool) -> Attempt:  # noqa: ARG001
-    """Detect twice the features, at twice the resolution."""
+    """Detect twice as many features, at twice the resolution."""
     features = 2 * sfm.features_per_image(images, conf.max_num_features)
     return Attempt("finer", replace(conf, max_num_features=features, first_octave=-1))
 
 
 def narrower(conf: SfmConf, images: int, *, any_smaller: bool) -> Attempt:  # noqa: ARG001
-    """Accept a quarter of the first pair's angle."""
+    """Require only a quarter of the triangulation angle of the first pair."""
     return Attempt("narrower", replace(conf, init_min_tri_angle=conf.init_min_tri_angle / 4))
 
 
 def other_size(conf: SfmConf, images: int, *, any_smaller: bool) -> Attempt | None:  # noqa: ARG001
-    """Give the LR images the other way: `native` instead of `upsampled`, or the reverse."""
+    """Use `native` instead of `upsampled` LR images, or the reverse."""
     other = "native" if conf.lr_images == "upsampled" else "upsampled"
     return Attempt(other, replace(conf, lr_images=other)) if any_smaller else None
 
 
-#: The attempts after the first, in order. Each changes the settings of the attempt before it, and
-#: gets the number of images and whether any of them is smaller than the largest; None skips it.
-#: ALIKED and LightGlue are none of them: pycolmap's wheels are built without ONNX, and abort the
-#: process where these are asked for.
+#: The attempts after the first, in order. Each function gets the settings of the previous attempt,
+#: the number of images, and whether any is smaller than the largest; a result of None is skipped.
+#: ALIKED and LightGlue are missing: pycolmap's wheels are built without ONNX, and abort the process
+#: if these are used.
 FALLBACKS = (relaxed, finer, narrower, other_size)
 
 
 @dataclass(frozen=True)
 class Registration:
-    """The reconstruction that was chosen, and a report of every attempt."""
+    """The best reconstruction, and a report of every attempt."""
 
     model: sfm.Reconstruction
     refused: str
-    """Why even the best reconstruction is not accepted; empty where it is."""
+    """Why the best reconstruction is not accepted; empty if it is accepted."""
     attempt: Attempt
-    """How it was made."""
+    """The attempt that made it."""
     attempts: list[dict[str, Any]]
-    """For each attempt its name, why it was refused, its seconds, settings and results."""
+    """Name, reason of refusal, time (seconds), settings and results of each attempt."""
 
 
 def register(
@@ -119,15 +119,15 @@ def register(
     """Run SfM on the mixed-resolution images, until a reconstruction is accepted.
 
     Args:
-        photos: The photographs, with their `sfm` copies, and `sfm_lr` copies of the degraded ones.
-        degraded: Indices of the views that SfM gets degraded.
+        photos: The photographs, with `sfm` copies, and `sfm_lr` copies of the degraded views.
+        degraded: Indices of the views that are degraded for SfM.
         conf: The settings of the first attempt.
-        work: An existing folder for SfM's own files.
-        refusal: Returns why a reconstruction is refused; an empty text accepts it.
+        work: An existing folder for SfM's files.
+        refusal: Returns why a reconstruction is refused, or an empty text to accept it.
 
     Returns:
-        The reconstruction with the most registered views of those that were accepted, or of all
-        where none was; the earlier one of two with equally many.
+        The accepted reconstruction with the most registered views; if none is accepted, the
+        refused one with the most. Of equal ones, the first.
     """
     best: tuple[sfm.Reconstruction, str, Attempt] | None = None
     reports: list[dict[str, Any]] = []
@@ -135,7 +135,7 @@ def register(
 
     def run(attempt: Attempt) -> tuple[sfm.Reconstruction, str, Attempt]:
         start = time.perf_counter()
-        # Attempts with the same features and matches share a folder, where COLMAP finds them.
+        # Attempts with the same features and matches share a folder, so that COLMAP reuses them.
         folder = folders.setdefault(_features_of(attempt), work / f"sfm-{attempt.name}")
         model = _reconstruct(photos, degraded, attempt, folder)
         reason = refusal(model)
@@ -169,7 +169,7 @@ def _error(model: sfm.Reconstruction) -> float:
 
 
 def _notes(attempt: Attempt, photos: PhotoCollection) -> Iterator[str]:
-    """Say what an attempt did otherwise than EXIF says."""
+    """Yield notes on differences of an attempt from EXIF."""
     if not attempt.uses_exif:
         focals = sorted({photo.focal_35mm for photo in photos.all if photo.focal_35mm})
         shown = ", ".join(f"{focal:g}" for focal in focals)
@@ -205,9 +205,9 @@ def sfm_attempts(
     """Yield the attempts to run SfM, in order.
 
     Args:
-        conf: The settings of the first attempt; `fallbacks` says whether there are others.
+        conf: The settings of the first attempt; without `fallbacks` it is the only one.
         images: The number of images.
-        any_smaller: Whether any image is smaller than its HR view.
+        any_smaller: Whether any image is smaller than its `Photograph.sfm`.
         any_focal: Whether EXIF gives the focal length of any image.
     """
     attempt = Attempt("configured", conf)
@@ -222,7 +222,7 @@ def sfm_attempts(
 
 
 def _features_of(attempt: Attempt) -> tuple[object, ...]:
-    """Return what decides features, matches and the cameras that they begin with."""
+    """Return the settings that features, matches and initial cameras depend on."""
     conf = attempt.conf
     settings = conf.lr_images, conf.max_num_features, conf.first_octave
     return *settings, attempt.uses_exif, tuple(attempt.apart.items())
@@ -231,13 +231,13 @@ def _features_of(attempt: Attempt) -> tuple[object, ...]:
 def sfm_images(
     photos: PhotoCollection, degraded: Collection[int], attempt: Attempt
 ) -> list[sfm.SfmImage]:
-    """Return the image of each photograph for SfM, with the intrinsics that are known.
+    """Return the image of each photograph for SfM, with known intrinsics.
 
     Args:
-        photos: The photographs, with their `sfm` copies, and `sfm_lr` copies of the degraded ones;
-            upsampled copies are made where they are needed.
-        degraded: Indices of the views that SfM gets degraded.
-        attempt: Its settings say how smaller images are given.
+        photos: The photographs, with `sfm` copies, and `sfm_lr` copies of the degraded views.
+            Upsampled copies are made if needed.
+        degraded: Indices of the views that are degraded for SfM.
+        attempt: The settings.
     """
     result = []
     for i, photo in enumerate(photos.all):
@@ -248,7 +248,7 @@ def sfm_images(
         lens = photo.lens and photo.lens.resized(width, height)
         focal_35mm = photo.focal_35mm if attempt.uses_exif and i not in attempt.apart else None
         focal = focal_35mm and focal_35mm * math.hypot(width, height) / _FILM_DIAGONAL
-        # Where the intrinsics are known, each image has a camera of its own, with its own K.
+        # With known intrinsics, each image has its own camera.
         camera = photo.name if lens else f"{photo.camera} {width}x{height}"
         if i in attempt.apart:
             camera += f" {attempt.apart[i]}"
@@ -265,7 +265,7 @@ def _kind(index: int, degraded: Collection[int]) -> str:
 def _reconstruct(
     photos: PhotoCollection, degraded: Collection[int], attempt: Attempt, work: Path
 ) -> sfm.Reconstruction:
-    """Run SfM once; the cameras of the result are the HR views'."""
+    """Run SfM once, and convert the cameras to those of the HR views."""
     work.mkdir(exist_ok=True)
     given = sfm_images(photos, degraded, attempt)
     model = sfm.reconstruct(given, photos.folder, work, attempt.conf)
@@ -276,5 +276,5 @@ def _reconstruct(
 def reconstruct_undegraded(
     photos: PhotoCollection, attempt: Attempt, work: Path
 ) -> sfm.Reconstruction:
-    """Run SfM once on the undegraded photographs, as in an attempt."""
+    """Run SfM once on the undegraded photographs, with the settings of an attempt."""
     return _reconstruct(photos, (), attempt, work / "sfm-reference")

@@ -1,4 +1,4 @@
-"""Decides which views are held out, which stay HR, and which size they have, from numbers alone."""
+"""Decides which views are test, HR and LR views, and their sizes, without reading images."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from xrgs.splat.settings import SSIM_WINDOW
 if TYPE_CHECKING:
     from xrgs.config import VariantConf
 
-#: The largest `variant.phone.blur`, LR px: more than a lens or a hand gives. Our choice.
+#: Largest `variant.phone.blur`, LR px: more than the blur of a lens or a moving hand. Our choice.
 _MOST_BLUR = 10
 
 
@@ -35,19 +35,19 @@ class TooSmallError(XrgsError):
 
 @dataclass(frozen=True)
 class Split:
-    """Indices of the views in the order of their names; the three are disjoint and cover all."""
+    """Indices of views, sorted by name, in three disjoint sets that cover all views."""
 
     test: tuple[int, ...]
-    """The held-out views: never trained on, never degraded."""
+    """Held-out views: never trained on, never degraded."""
     hr: tuple[int, ...]
-    """The training views that stay as they are."""
+    """Training views tagged HR."""
     lr: tuple[int, ...]
-    """The training views tagged LR; they are degraded where the variant degrades."""
+    """Training views tagged LR, which the variant's degradation, if any, is applied to."""
 
 
 @dataclass(frozen=True)
 class HrGeometry:
-    """How a photograph becomes an HR view: resized, then cropped about its centre."""
+    """The geometry of an HR view: the photograph is resized, then cropped around its centre."""
 
     resized: tuple[int, int]
     """Width and height before the crop, px."""
@@ -63,10 +63,10 @@ class HrGeometry:
 
 
 def check_variant_conf(conf: VariantConf) -> None:
-    """Refuse a config from which no variant can be made.
+    """Check the ranges of a variant's config.
 
     Raises:
-        XrgsError: A value is out of its range; the message names the key, the value and the range.
+        XrgsError: A value is out of range; the message names the key, the value and the range.
     """
     rules = {
         "factor": (conf.factor >= 1, "1 or more"),
@@ -115,7 +115,7 @@ def check_test_names(names: Sequence[str], conf: VariantConf) -> None:
         conf: The variant's config.
 
     Raises:
-        XrgsError: A name in `variant.test` is not among them; the message has the most similar one.
+        XrgsError: A name in `variant.test` is not among them; the message suggests a similar name.
     """
     missing = [name for name in conf.test if name not in names]
     if not missing:
@@ -130,9 +130,10 @@ def check_test_names(names: Sequence[str], conf: VariantConf) -> None:
 
 
 def _meant(given: Sequence[str], names: Sequence[str]) -> list[str]:
-    """Replace each name that a scene lacks by the most similar one.
+    """Replace each name that the scene does not have by the most similar name.
 
-    A name with commas was taken for several, and the quotes of a name for those of a text.
+    A name with commas may have been parsed as several names, and quotes in a name as quotes of
+    YAML.
     """
     meant, rest = [], list(given)
     while rest:
@@ -151,7 +152,7 @@ def _meant(given: Sequence[str], names: Sequence[str]) -> list[str]:
 
 
 def _words(names: Sequence[str]) -> str:
-    """Say how views are named on a command line and in YAML, where a name needs quotes there."""
+    """Return a hint on quoting for names that need quotes on a command line and in YAML."""
     values = {"true", "false", "null", "yes", "no", "on", "off"}
     plain = (re.fullmatch(r"[A-Za-z][\w.-]*", n) and n.casefold() not in values for n in names)
     if all(plain):
@@ -165,18 +166,18 @@ def _words(names: Sequence[str]) -> str:
 def split_views(
     names: Sequence[str], conf: VariantConf, scores: Sequence[float] | None = None
 ) -> Split:
-    """Hold out the views of `test`, or else every n-th, and divide the others into HR and LR.
+    """Hold out the views `test`, else every n-th view, and divide the other views into HR and LR.
 
     Args:
         names: The names of the views, sorted.
-        conf: The variant's config: HR is a fraction of the training views, at least `min_hr` of
-            them, or every view that scores `hr_above` or more.
-        scores: One score per view in 0..1, higher for HR; a view of NaN is LR. Views of one score
-            get one class, so that the fraction may be exceeded. None draws the HR views by
-            `variant.selection`.
+        conf: The variant's config. HR views are `hr_fraction` of the training views, at least
+            `min_hr`, or all views with a score of `hr_above` or more.
+        scores: A score for each view in 0..1, higher for HR; NaN means LR. Views with equal scores
+            get the same tag, so that there may be more HR views than `hr_fraction`. None selects
+            the HR views by `variant.selection`.
 
     Raises:
-        XrgsError: The scores put all training views into one class though the config asks for two.
+        XrgsError: The scores give all training views the same tag, but the config asks for both.
     """
     every, views = conf.test_every, range(len(names))
     if conf.test:
@@ -192,12 +193,13 @@ def split_views(
 def split_before_sfm(
     names: Sequence[str], sizes: Sequence[tuple[int, int]], conf: VariantConf
 ) -> Split:
-    """Split the views as far as is known before SfM.
+    """Split the views before SfM.
 
     Args:
         names: The names of the views, sorted.
         sizes: Width and height of each photograph, px.
-        conf: The variant's config. Where the tags depend on depth, all training views are HR.
+        conf: The variant's config. If tags depend on depth, all training views are HR until SfM is
+            done.
 
     Raises:
         XrgsError: As for `split_views`.
@@ -210,18 +212,18 @@ def split_before_sfm(
 
 
 def split_by_score(names: Sequence[str], measures: Sequence[Measures], conf: VariantConf) -> Split:
-    """Split the views by the scores of `variant.tags`, see `split_views`."""
+    """Split the views by the scores of the policy `variant.tags`, see `split_views`."""
     scores = [POLICIES[conf.tags].score(measured) for measured in measures]
     return split_views(names, conf, relative_to_largest(scores))
 
 
 def shortage(split: Split, registered: Set[int], conf: VariantConf) -> str:
-    """Say which views are too few to train and to test on; empty where there are enough.
+    """Return a text if too few views are registered for training and test, else an empty text.
 
     Args:
         split: All views.
-        registered: Indices of those that have a camera.
-        conf: The variant's config. Without a test view, tests are on the training views.
+        registered: Indices of the registered views.
+        conf: The variant's config. If it holds out no views, the training views are the test views.
     """
     hr, lr, tests = (registered & set(part) for part in (split.hr, split.lr, split.test))
     if not (conf.test or split.test):
@@ -236,7 +238,7 @@ def shortage(split: Split, registered: Set[int], conf: VariantConf) -> str:
 
 
 def split_notes(split: Split, conf: VariantConf) -> list[str]:
-    """Say where no view is LR though the config asks for some."""
+    """Return a note if no view is LR although the config asks for LR views."""
     views = len(split.hr)
     if split.lr or conf.tags != "flag" or conf.hr_fraction == 1:
         return []
@@ -250,7 +252,7 @@ def _hr_count(views: int, conf: VariantConf) -> int:
 
 
 def _select(train: Sequence[int], conf: VariantConf) -> set[int]:
-    """Select the HR views at random or evenly spaced, as `variant.selection` says."""
+    """Select the HR views, at random or evenly spaced, by `variant.selection`."""
     count = _hr_count(len(train), conf)
     if conf.selection == "uniform":
         return {train[(2 * k + 1) * len(train) // (2 * count)] for k in range(count)}
@@ -259,7 +261,7 @@ def _select(train: Sequence[int], conf: VariantConf) -> set[int]:
 
 
 def _select_by_score(train: Sequence[int], scores: Sequence[float], conf: VariantConf) -> set[int]:
-    """Select the HR views that score highest, or that score `hr_above` or more."""
+    """Select the views with the highest scores as HR, or those with `hr_above` or more."""
     known = sorted((scores[i] for i in train if not np.isnan(scores[i])), reverse=True)
     count = _hr_count(len(known), conf)
     threshold = conf.hr_above or (known[count - 1] if count else np.inf)
@@ -275,9 +277,10 @@ def _select_by_score(train: Sequence[int], scores: Sequence[float], conf: Varian
 
 
 def shrink_factor(sizes: Sequence[tuple[int, int]], long_side: int) -> float:
-    """Return the one factor in (0, 1] by which all photographs of a scene are resized.
+    """Return the common factor in (0, 1] for resizing all photographs of a scene.
 
-    It brings the longest side of all to `long_side`; it is 1 where that is 0 or larger.
+    With it the longest side of all photographs becomes `long_side`. It is 1 if `long_side` is 0 or
+    larger than all sides.
 
     Args:
         sizes: Width and height of each photograph, px.
@@ -292,15 +295,15 @@ def hr_geometry(size: tuple[int, int], shrink: float, conf: VariantConf) -> HrGe
 
     Args:
         size: Width and height of the photograph, px.
-        shrink: The factor of `shrink_factor` for its scene.
+        shrink: The result of `shrink_factor` for the scene.
         conf: The variant's config.
 
     Raises:
         TooSmallError: The LR view, `factor` times smaller, would be smaller than the SSIM window of
-            the training loss; the message says which key can help.
+            the training loss; the message names a key to change.
     """
     resized = round(size[0] * shrink), round(size[1] * shrink)
-    # The crop makes x and y shrink by the same whole factor; else they differ by up to 0.6%.
+    # The crop makes the factor of x and y exactly equal; without it they differ by up to 0.6%.
     lr = resized[0] // conf.factor, resized[1] // conf.factor
     if min(lr) < SSIM_WINDOW:
         helps = []

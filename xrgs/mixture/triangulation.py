@@ -1,4 +1,4 @@
-"""Finds points where poses are given without any, as in the scenes of Blender and instant-ngp."""
+"""Triangulates points for poses without points, as in the scenes of Blender and instant-ngp."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ def with_points(
     conf: SfmConf,
     work: Path,
 ) -> sfm.Reconstruction:
-    """Triangulate the points of a model that has cameras alone.
+    """Triangulate points for a model that has only cameras.
 
-    As SfM does, it sees the degraded views, resized to the size of their HR views.
+    As in SfM, LR views are degraded, and resized to the size of their HR views.
 
     Args:
         model: Cameras and poses of HR views.
-        photos: The photographs, with their `hr` copies and the `lr` copies of the degraded ones.
-        degraded: Indices of the views that are degraded.
-        conf: The settings of features.
+        photos: The photographs, with `hr` copies, and `lr` copies of the degraded views.
+        degraded: Indices of the degraded views.
+        conf: The settings of feature detection.
         work: An existing folder for temporary files.
 
     Raises:

@@ -1,7 +1,7 @@
 """Finds, builds and freezes variants on disk; cells share them.
 
-`frozen` reads and writes the folder of a variant. Nothing here imports torch before a variant is
-built, so that a plan can read variants.
+`xrgs.mixture.saved_variant` reads and writes the folder of a variant. torch is imported only to
+build a variant, so that planning is quick.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ __all__ = [
 _log = logging.getLogger(__name__)
 
 _DEGRADATIONS, _TAGS = "mixture/degradations", "mixture/tags"
-#: The code that makes variants of photographs. Every file counts always, but those that read given
-#: poses, degrade views and tag views: these count where they are on.
+#: The code that makes variants from photographs. Every file counts for every variant, except the
+#: code for given poses, degradations and tags: these files count only if the variant uses them.
 _CODE = CodeFolders(
     folders=("mixture",),
     whole_parts=("mixture/poses",),
@@ -68,8 +68,8 @@ def key(scene: SceneConf, conf: VariantConf) -> str:
         16 hexadecimal digits.
 
     Raises:
-        XrgsError: The photographs or the poses are not there, or the config is not usable; the
-            message names what is wrong.
+        XrgsError: The photographs or the poses are missing, or the config is not usable; the
+            message says why.
     """
     split.check_variant_conf(conf)
     split.check_test_names(scenes.names(scene, conf.long_side) if conf.test else (), conf)
@@ -80,7 +80,7 @@ def key(scene: SceneConf, conf: VariantConf) -> str:
 
 
 def _settings(conf: VariantConf) -> dict[str, Any]:
-    """Return the settings that decide what a variant is, without those of other degradations."""
+    """Return the settings that a variant depends on, without those of other degradations."""
     used = resolve_degradation(conf)
     unused = {key for name, way in DEGRADATIONS.items() if name != used for key in way.keys}
     values = {key: value for key, value in identity_values(conf).items() if key not in unused}
@@ -88,9 +88,9 @@ def _settings(conf: VariantConf) -> dict[str, Any]:
 
 
 def code(conf: VariantConf) -> dict[str, str]:
-    """Return the digest of each part of the code that makes a variant of a scene's photographs.
+    """Return part -> digest, for the code that makes a variant from a scene's photographs.
 
-    The code that provides these counts in the fingerprint of the scene.
+    The code that provides the photographs is part of the scene's fingerprint instead.
     """
     files = {"core": _CODE.core()}
     if conf.poses is not None:
@@ -105,18 +105,18 @@ def code(conf: VariantConf) -> dict[str, str]:
 
 
 def all_code(scene: SceneConf, conf: VariantConf) -> dict[str, str]:
-    """Return `code`, and the digest of the code that provides the photographs of the scene."""
+    """Return `code` with the digest of the code that provides the scene's photographs added."""
     return {"scene": scenes.code_of(scene.kind), **code(conf)}
 
 
 def find(variants: Path, wanted_key: str) -> Variant | None:
-    """Find the frozen variant of a key, and verify it; a corrupt one is logged and passed over.
+    """Find and verify the frozen variant of a key; log and ignore corrupt variants.
 
     Returns:
-        The variant; None where there is no intact one.
+        The variant; None if there is no intact one.
 
     Raises:
-        UnreadableError: A variant can't be read now; nothing is known of it.
+        UnreadableError: A variant can't be read at the moment; it may be intact.
     """
     for folder in _of_key(variants, wanted_key):
         try:
@@ -132,15 +132,15 @@ def _of_key(variants: Path, wanted_key: str) -> list[Path]:
 
 
 def failure(variants: Path, wanted_key: str) -> str | None:
-    """Read why the scene of a key could not be made into a variant when it was last tried.
+    """Read why the last attempt to make the variant of a key failed.
 
-    A key covers photographs, config and code, so that a failure says nothing about any others.
+    A key depends on photographs, config and code, so a change of any of these is tried again.
 
     Returns:
-        The reason; None where the key did not fail, or its report is damaged.
+        The reason; None if there was no failure, or the report is damaged.
 
     Raises:
-        UnreadableError: The report can't be read now.
+        UnreadableError: The report can't be read at the moment.
     """
     folder = paths.failed_folder(variants, wanted_key)
     try:
@@ -152,18 +152,18 @@ def failure(variants: Path, wanted_key: str) -> str | None:
 
 
 def build(scene: SceneConf, conf: VariantConf, variants: Path, cache: Path) -> Variant:
-    """Find the variant of a scene, or make it; any number of processes may call this at once.
+    """Find the variant of a scene, or make it; several processes may call this concurrently.
 
     Args:
         scene: The scene's config.
         conf: The variant's config.
-        variants: The store's folder of variants; it is made where the store exists.
+        variants: The store's folder of variants, created if missing; the store must exist.
         cache: The store's folder of rendered scenes.
 
     Raises:
-        UnreadableError: The variant is there, but can't be read now; it is left as it is.
+        UnreadableError: The variant exists, but can't be read at the moment; it is not changed.
         SceneFailed: SfM can't register enough views; its report is in `variants/failed-<key>`.
-        XrgsError: The config or the photographs are not usable; the message names what is wrong.
+        XrgsError: The config or the photographs are not usable; the message says why.
     """
     wanted_key = key(scene, conf)
     variants.mkdir(exist_ok=True)
@@ -196,7 +196,7 @@ def _make(
     variants: Path,
     made_by: dict[str, str],
 ) -> Variant:
-    """Make and freeze a variant, after what a killed process left of it is removed."""
+    """Make and freeze a variant; first remove the unfinished work of killed processes."""
     from xrgs.mixture import mixing
 
     work = variants / f".{wanted_key}.building"

@@ -13,7 +13,7 @@ from xrgs.errors import XrgsError
 
 
 class SceneFailed(XrgsError):  # noqa: N818
-    """A scene can't be made into a variant, as the paper's Leaves; `report` says how SfM went."""
+    """No variant can be made of a scene, as of the paper's Leaves; `report` has SfM's results."""
 
     def __init__(self, message: str, report: dict[str, Any]) -> None:
         super().__init__(message)
@@ -22,15 +22,15 @@ class SceneFailed(XrgsError):  # noqa: N818
 
 @dataclass(frozen=True)
 class View:
-    """One undistorted photograph on disk, and its pinhole camera."""
+    """An undistorted photograph on disk, and its pinhole camera."""
 
     name: str
-    """The photograph's file name without its suffix."""
+    """File name of the photograph without suffix."""
     file: Path
     """A PNG, 8-bit RGB, of exactly `width` x `height` px."""
     split: str
-    """`train`, `test` or `original`. An original is a degraded training view before it was
-    degraded: from the same pose, at its own size, for the control that degrades nothing."""
+    """`train`, `test` or `original`. An original is a degraded training view before degradation,
+    with the same pose, at full size, for the control without degradation."""
     tag: str
     """`HR` or `LR`, the classes of the paper's method. Test views and originals are `HR`."""
     width: int
@@ -40,41 +40,42 @@ class View:
     viewmat: NDArray[np.float64]
     """World to camera [4, 4], in the world of SfM, OpenCV axes."""
     sampling_rate: float
-    """The relative sampling rate, in (0, 1]: focal length (px) / median depth of the SfM points
-    that the view observes, over the largest such ratio of the variant. Downsampling a view by
-    `factor` divides it by `factor`."""
+    """Relative sampling rate, in (0, 1]: focal length (px) over median depth of the view's SfM
+    points, divided by the largest such ratio of the variant. Downsampling a view by `factor`
+    divides it by `factor`."""
     mask: Path | None = None
-    """An 8-bit grey PNG of the same size: 255 where a pixel is used, 0 elsewhere. None uses all.
-    Below it the file has the photograph, or what a degradation made of its neighbours."""
+    """An 8-bit grey PNG of the same size: 255 for a used pixel, 0 for a masked one. None uses all.
+    The masked pixels in `file` are those of the photograph, or if degraded, filled with the colours
+    of their neighbours."""
     supersampling: float = 1.0
-    """How many times as many px a side the view needs to show what it sees as finely as the finest
+    """Factor of width and height at which the view would show its content as finely as the finest
     training views (`xrgs.mixture.sampling_rate.needed_factors`): about 1 for an HR view and about
-    `factor` for a degraded one. A digital zoom counts with the pixels that it resolves."""
+    `factor` for a degraded one. For a digital zoom, the size before upsampling counts."""
 
 
 @dataclass(frozen=True)
 class Variant:
-    """A frozen mixed-resolution dataset, which cells train and are evaluated on."""
+    """A frozen mixed-resolution dataset for the training and evaluation of cells."""
 
     id: str
     """`<key>-<hash>`, where the hash covers the images, the cameras and the SfM points."""
     folder: Path
-    """The folder that it was loaded from."""
+    """Folder of the variant."""
     scene: str
-    """The scene's name when the variant was built; a label that is not part of the hash."""
+    """Name of the scene when the variant was built; a label that is not part of the hash."""
     factor: int
-    """How many times fewer pixels per side the method takes LR views to have. The HR views of
-    real captures are cropped to multiples of it too."""
+    """Size of HR views over size of LR views, as the method assumes it. The sizes of HR views are
+    multiples of it."""
     held_out: bool
-    """False where there are too few views to hold any out: the test views are then the HR versions
-    of the training poses."""
+    """False if there are too few views to hold any out. The test views then are the training views
+    in HR."""
     views: tuple[View, ...]
     """All views, sorted by (split, name)."""
     points: NDArray[np.float64]
     """SfM points [P, 3], in the world of SfM."""
     colors: NDArray[np.uint8]
-    """Their colours [P, 3]."""
+    """Colours of the points [P, 3]."""
     report: dict[str, Any]
-    """How SfM went: registered views, points, reprojection error, every attempt."""
+    """Results of SfM: registered views, points, reprojection error, every attempt."""
     world: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
     """The rigid transform [4, 4] from the world of given poses to the world of views and points."""

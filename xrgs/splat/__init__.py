@@ -1,6 +1,6 @@
 """The splatting model: Gaussians, cameras, rasterizer, loss, optimizer and densification.
 
-The package knows nothing of XR-GS, scenes or Hydra. Each operation that training repeats has a
-public module here, which checks its arguments, and one implementation in `torch/` and one in
-`native/`, which `backend.implementation` chooses between.
+The package is independent of XR-GS, scenes and Hydra. Each operation of a training step has a
+public module here, which checks the arguments, and two implementations, in `torch/` and in
+`native/`. `backend.implementation` chooses between them.
 """

@@ -1,4 +1,4 @@
-"""Attributes the pixels of a view to the Gaussians that are blended into them."""
+"""Sums a map over a view's pixels for each Gaussian, by its blending weight in each pixel."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from xrgs.splat.sh import C0
 
 @dataclass(frozen=True)
 class Attribution:
-    """A map of a view's pixels, summed for each Gaussian."""
+    """The result of `attribute_pixels`."""
 
     sums: Tensor
     """[N] sums over the pixels, in the unit of the map times px; 0 for hidden Gaussians."""
@@ -33,7 +33,7 @@ def attribute_pixels(
     *,
     backend: str = "torch",
 ) -> Attribution:
-    """Sum a map of a view's pixels, weighted by each Gaussian's part in them.
+    """Sum a map over a view's pixels for each Gaussian, by its blending weight in each pixel.
 
     The sum of Gaussian i is
 
@@ -47,14 +47,14 @@ def attribute_pixels(
     with respect to the Gaussian's colour: one forward and one backward pass.
 
     Args:
-        pixels: [H, W] the map e, of the type of the Gaussians.
+        pixels: [H, W] the map e, of the Gaussians' dtype.
         gaussians: N Gaussians; their colours are not read.
         camera: The view.
         settings: How Gaussians become pixels.
         backend: `torch`, `native` or `auto` (`resolve_backend`).
 
     Returns:
-        The sums, without a graph, and the number of alpha evaluations.
+        The sums, detached from autograd, and the number of alpha evaluations.
 
     Raises:
         ValueError: The map is not of the camera's size, or as for `rasterize_parameters`.

@@ -1,8 +1,8 @@
 """The choice between the implementations of the model: compiled kernels, plain torch, or gsplat.
 
 `native` and `torch` run on the CPU. `gsplat` runs on a GPU: `gsplat.rasterization` renders, and the
-functions of `torch` do all else. This module imports torch only for a GPU, so that a plan can name
-the backend of its cells.
+functions of `torch` do the rest. This module imports torch only for `gsplat`, so that planning a
+study stays quick.
 """
 
 from __future__ import annotations
@@ -23,18 +23,17 @@ NATIVE_MODULE = "xrgs._native"
 CHOICES = ("auto", "native", "torch", "gsplat")
 REQUIRE_NATIVE = "XRGS_REQUIRE_NATIVE"
 DEVICES = {"native": "cpu", "torch": "cpu", "gsplat": "cuda"}
-"""Where each backend has its tensors."""
+"""Device of each backend's tensors."""
 _GSPLAT_ALPHA_MAX = {"1.5.3": 0.999, "1.6": 0.99}
-"""The versions of gsplat that are known, and the largest alpha in the kernels of each."""
+"""Supported versions of gsplat -> the cap of alpha in the kernels of each."""
 
 Operation = Literal["activations", "densify", "loss", "optimizer", "rasterizer", "resample"]
-"""The name of a module that both `xrgs/splat/torch/` and `xrgs/splat/native/` have.
-
-`xrgs/splat/gsplat/` has the rasterizer only."""
+"""A module of `xrgs/splat/torch/` and `xrgs/splat/native/`; `xrgs/splat/gsplat/` has only the
+rasterizer."""
 
 
 def resolve_backend(name: str) -> str:
-    """Return the backend that a configured name means on this machine.
+    """Choose the backend on this machine for a configured name.
 
     Args:
         name: `native`, `torch`, `gsplat`, or `auto`. `auto` means native if the extension was
@@ -45,9 +44,9 @@ def resolve_backend(name: str) -> str:
         `native`, `torch` or `gsplat`.
 
     Raises:
-        ValueError: The name is none of the four.
+        ValueError: The name is unknown.
         XrgsError: The native backend is configured or required, and was not built; or gsplat is
-            configured, and is not installed or of a version that is not known.
+            configured, and is missing or of an unsupported version.
     """
     if name not in CHOICES:
         raise ValueError(f"backend must be one of {', '.join(CHOICES)}, got {name!r}")
@@ -67,7 +66,7 @@ def resolve_backend(name: str) -> str:
 
 
 def implementation(operation: Operation, backend: str) -> ModuleType:
-    """Return the module that computes an operation, importing it when it is first needed.
+    """Return the module that implements an operation; it is imported at the first call.
 
     The modules of an operation have functions of the same names and parameters in all backends.
 
@@ -76,7 +75,8 @@ def implementation(operation: Operation, backend: str) -> ModuleType:
         backend: `torch`, `native`, `gsplat` or `auto`, as for `resolve_backend`.
 
     Returns:
-        `xrgs.splat.<backend>.<operation>`, of torch for all operations of gsplat but `rasterizer`.
+        `xrgs.splat.<backend>.<operation>`. The backend gsplat has only `rasterizer`; its other
+        operations are those of torch.
 
     Raises:
         ValueError: As for `resolve_backend`.
@@ -89,7 +89,7 @@ def implementation(operation: Operation, backend: str) -> ModuleType:
 
 
 def device(backend: str) -> str:
-    """Return the device of the tensors of a backend, which is ready to render.
+    """Return the device of a backend's tensors, after checking that the backend can render.
 
     Args:
         backend: `native`, `torch` or `gsplat`.
@@ -98,8 +98,8 @@ def device(backend: str) -> str:
         `cpu`, or `cuda` for gsplat.
 
     Raises:
-        XrgsError: The backend is gsplat, and torch sees no GPU, or gsplat's kernels are not built
-            and can't be. The message says what is missing.
+        XrgsError: The backend is gsplat, and torch sees no GPU, or gsplat's kernels can't be built.
+            The message says what is missing.
     """
     if backend == "gsplat":
         implementation("rasterizer", backend)
@@ -107,14 +107,14 @@ def device(backend: str) -> str:
 
 
 def check_raster(backend: str, raster: RasterSettings) -> None:
-    """Refuse settings that gsplat has as constants of its kernels, of another value.
+    """Refuse settings that differ from the constants of gsplat's kernels.
 
     Args:
         backend: `native`, `torch` or `gsplat`.
         raster: How Gaussians become pixels.
 
     Raises:
-        XrgsError: The backend is gsplat, and a setting differs; the message names its key.
+        XrgsError: The backend is gsplat, and a setting differs; the message names the setting.
     """
     if backend != "gsplat":
         return
@@ -130,9 +130,9 @@ def check_raster(backend: str, raster: RasterSettings) -> None:
 
 @functools.cache
 def _gsplat_version() -> tuple[str, float]:
-    """Return the version of gsplat that is installed, and the largest alpha in its kernels."""
+    """Return the installed version of gsplat, and the cap of alpha in its kernels."""
     try:
-        version = metadata.version("gsplat").partition("+")[0]  # +pt24cu124 names a build
+        version = metadata.version("gsplat").partition("+")[0]  # without a build tag as +pt24cu124
     except metadata.PackageNotFoundError:
         raise XrgsError(
             "splat.backend=gsplat: gsplat is not installed: pip install 'xrgs[gsplat]'"
@@ -147,19 +147,19 @@ def _gsplat_version() -> tuple[str, float]:
 
 
 def arithmetic(backend: str) -> str:
-    """Return the arithmetic that decides the last bits of a backend's results.
+    """Name the arithmetic on which the last bits of a backend's results depend.
 
-    All instruction sets with a fused multiply-add, which rounds a product and a sum once, give the
-    same bits in the native kernels. Instruction sets without it round twice and give other bits.
+    The native kernels give the same bits on all instruction sets with a fused multiply-add, which
+    rounds only once. Instruction sets without it round product and sum, and give other bits.
 
     Args:
         backend: `native`, `torch` or `gsplat`.
 
     Returns:
-        `fma` or `no-fma` for the instruction set that the native kernels use in this process, or
-        `torch`: torch chooses an instruction set for each operation, and its last bits depend on
-        the processor and the number of threads. Or `gsplat <version>`: versions of gsplat have
-        other constants, and the last bits differ from run to run.
+        - `fma` or `no-fma`: the instruction set that the native kernels use in this process.
+        - `torch`: the last bits depend on the processor and the number of threads.
+        - `gsplat <version>`: each version has its own constants, and the last bits differ from run
+          to run.
 
     Raises:
         XrgsError: The backend is native and its module can't be loaded on this machine, or the
@@ -179,7 +179,7 @@ def arithmetic(backend: str) -> str:
     return "fma" if native.fused_multiply_add() else "no-fma"
 
 
-#: Imports a module, and remembers it: a training step asks for several.
+#: Imports a module, and caches it, since each training step asks for several.
 _module = functools.cache(importlib.import_module)
 
 

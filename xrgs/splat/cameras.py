@@ -1,4 +1,4 @@
-"""The pinhole camera that Gaussians are projected with."""
+"""The pinhole camera."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ import torch
 from torch import Tensor
 
 ORTHONORMAL_TOLERANCE = 1e-3
-"""Largest entry of R R^T - I for the rotation R of a viewmat. The float32 exports of SfM are at
-1e-6; a matrix with a scale is far above."""
+"""Largest entry of R R^T - I for the rotation R of a viewmat. SfM exports in float32 have 1e-6; a
+matrix with a scale has far more."""
 LAST_ROW_TOLERANCE = 1e-5
-"""How far the last row of a viewmat or of K may be from 0, ..., 0, 1: inverses are rounded."""
+"""Tolerance of the last row of a viewmat or of K, (0, ..., 0, 1): inverted matrices are rounded."""
 
 
 class CameraNumbers(NamedTuple):
-    """A camera as plain numbers, which a kernel takes without a torch operation."""
+    """A camera as Python numbers, which the kernels take without a torch operation."""
 
     viewmat: list[float]
     """The 16 numbers of `Camera.viewmat`, row by row."""
@@ -42,9 +42,9 @@ class Camera:
         height: Height of the image, px.
 
     Raises:
-        ValueError: A matrix has the wrong shape or values that are not finite, `viewmat` is not
-            rigid, `K` has skew or a focal length that is not above 0, the last row of either is not
-            0, ..., 0, 1, or the image has no pixel. The message names the field.
+        ValueError: A matrix has the wrong shape, values that are not finite or a last row other
+            than 0, ..., 0, 1; `viewmat` is not rigid; `K` has skew or a focal length of 0 or less;
+            or the image has no pixel. The message names the field.
 
     Examples:
         >>> K = torch.tensor([[40.0, 0.0, 24.0], [0.0, 40.0, 16.0], [0.0, 0.0, 1.0]])
@@ -85,25 +85,25 @@ class Camera:
     @property
     def position(self) -> Tensor:
         """The camera's centre [3], world units."""
-        # Written out, since the order in which torch's products add depends on the processor.
+        # Not a matrix product: the order in which torch adds depends on the processor.
         first, second, third = (row[:3] * row[3] for row in self.viewmat[:3])
         position: Tensor = -(first + second + third)  # [3]
         return position
 
     @cached_property
     def numbers(self) -> CameraNumbers:
-        """The camera as plain numbers, computed once: a training renders a view many times."""
+        """The camera as Python numbers, cached, since training renders each view many times."""
         (fx, _, cx), (_, fy, cy), _ = self.K.tolist()
         viewmat = self.viewmat.flatten().tolist()
         return CameraNumbers(viewmat, [fx, fy, cx, cy], self.position.tolist())
 
     def resized(self, width: int, height: int) -> Camera:
-        """Return this camera with the same view at another size, px."""
+        """Return the camera of the same view at another image size, px."""
         scale = self.K.new_tensor([[width / self.width], [height / self.height], [1.0]])  # [3, 1]
         return Camera(self.viewmat, self.K * scale, width, height)
 
     def to_camera(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Transform points from the world to the camera.
+        """Transform points from world to camera coordinates.
 
         Args:
             points: [P, 3] world units, float32 or float64.
@@ -126,17 +126,17 @@ class Camera:
 
         Args:
             points: [P, 3] world units, float32 or float64.
-            near: Points of this depth and less are not in the image, world units.
+            near: Points at this depth or nearer count as outside, world units.
             margin: Fraction of the image's size by which a point may lie outside.
 
         Returns:
-            x, y and z [P] each as `to_camera` has them, and which points are in the image [P] bool.
+            x, y and z [P] each of `to_camera`, and which points are in the image [P] bool.
         """
         K = self.K.to(points)
         x, y, depth = self.to_camera(points)
         inside = depth > near
         for axis, place, size in ((0, x, self.width), (1, y, self.height)):
-            # Homogeneous pixels: compared before the division by depth, which may be 0.
+            # Pixel times depth: dividing by the depth fails where it is 0.
             pixels = K[axis, axis] * place + K[axis, 2] * depth
             inside &= (pixels >= -margin * size * depth) & (pixels <= (1 + margin) * size * depth)
         return x, y, depth, inside
@@ -152,22 +152,22 @@ class Camera:
         fov: float = 50.0,
         up: Sequence[float] = (0.0, 0.0, 1.0),
     ) -> Camera:
-        """Return a camera that stands at a position and looks at a target.
+        """Return a camera at a position that looks at a target.
 
         Args:
-            position: Where the camera stands: x, y, z in world units.
-            target: What it looks at, which becomes the centre of the image: x, y, z in world units.
+            position: Centre of the camera: x, y, z in world units.
+            target: Point at the centre of the image: x, y, z in world units.
             width: Width of the image, px.
             height: Height of the image, px.
             fov: Horizontal field of view, degrees, above 0 and below 180.
-            up: The direction in the world that points up in the image, of any length.
+            up: World direction that points up in the image, of any length.
 
         Returns:
             The camera, float32, with square pixels.
 
         Raises:
-            ValueError: `fov` is out of range, the position is the target, or `up` is along the
-                line between them.
+            ValueError: `fov` is out of range, position and target are the same point, or `up` is
+                parallel to the line between them.
         """
         if not 0 < fov < 180:
             raise ValueError(f"fov must be above 0 and below 180 degrees, got {fov}")

@@ -1,4 +1,4 @@
-"""The Gaussians of a scene, as the raw parameters that the optimizer moves."""
+"""The Gaussians of a scene, as the raw parameters that the optimizer trains."""
 
 from __future__ import annotations
 
@@ -16,14 +16,15 @@ from xrgs.splat.backend import implementation
 from xrgs.splat.sh import bases, check_degree, colors_to_sh0
 
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh0", "shN")
-"""Names of the parameters, in the order that functions take them; gsplat's names."""
+"""Names of the parameters, as in gsplat, in the order of all functions' arguments."""
 
 MIN_SPACING = 1e-7
-"""Smallest initial scale, world units: points that coincide would have a log scale of -inf."""
+"""Smallest initial scale, world units. Without it, coinciding points would get a log scale of
+-inf."""
 
 
 class ActivatedGaussians(NamedTuple):
-    """Gaussians after their activation functions; the fields are in the order of `PARAMETERS`."""
+    """Gaussians after the activation functions; the fields are in the order of `PARAMETERS`."""
 
     means: Tensor  # [N, 3] world units
     quats: Tensor  # [N, 4] wxyz, any length
@@ -35,9 +36,9 @@ class ActivatedGaussians(NamedTuple):
 
 @dataclass
 class Gaussians:
-    """N Gaussians as raw parameters: leaf tensors, on which gradients accumulate.
+    """N Gaussians as raw parameters: leaf tensors that accumulate gradients.
 
-    A parameter is also read and replaced by its name: `gaussians["means"]`.
+    `gaussians["means"]` is the same as `gaussians.means`, also for assignment.
 
     Examples:
         >>> points = torch.rand(50, 3) + torch.tensor([0.0, 0.0, 2.0])
@@ -89,12 +90,12 @@ class Gaussians:
         Args:
             points: [P, 3] world units, at least 4 points.
             colors: [P, 3], 8-bit, or floats in 0..1.
-            init_opacity: Opacity of each, between 0 and 1 (gsplat's default).
-            sh_degree: Highest band of the spherical harmonics that is stored, 0 to 3.
-            generator: Draws the quaternions; None takes one with seed 0.
+            init_opacity: Opacity of each Gaussian, above 0 and below 1; 0.1 is gsplat's default.
+            sh_degree: Highest stored band of the spherical harmonics, 0 to 3.
+            generator: Draws the quaternions; None takes a generator with seed 0.
 
         Returns:
-            P Gaussians, float32, with gradients on.
+            P Gaussians, float32 leaf tensors that require gradients.
 
         Raises:
             ValueError: As for the function `from_points`.
@@ -105,7 +106,7 @@ class Gaussians:
         )
 
     def to(self, device: str) -> Gaussians:
-        """Return the Gaussians on a device, as new leaf tensors unless they are there already."""
+        """Return the Gaussians on a device: themselves if they are there, else new leaf tensors."""
         if self.means.device.type == device:
             return self
         moved = {name: self[name].detach().to(device) for name in PARAMETERS}
@@ -114,8 +115,8 @@ class Gaussians:
     def raw(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Return the parameters in the order of `PARAMETERS`, with shN detached.
 
-        The gradient of shN, three quarters of all gradients, is then never computed. The optimizer
-        derives it from the gradient of sh0 (`SplatOptimizer.step`).
+        So autograd never computes the gradient of shN, three quarters of all gradients. The
+        optimizer derives it from the gradient of sh0 (`SplatOptimizer.step`).
         """
         return self.means, self.quats, self.scales, self.opacities, self.sh0, self.shN.detach()
 
@@ -129,7 +130,8 @@ class Gaussians:
                 float32 on the CPU only, and gives the same bits for any number of threads.
 
         Returns:
-            The Gaussians, differentiable in all parameters but shN; once on the native backend.
+            The Gaussians, differentiable in all parameters except shN, and on the native backend
+            only once.
 
         Raises:
             ValueError: The parameters are not float32 on the CPU for the native backend.
@@ -148,27 +150,26 @@ def from_points(
     sh_degree: int,
     generator: torch.Generator,
 ) -> Gaussians:
-    """Place a Gaussian on each SfM point (`create_splats_with_optimizers`, gsplat's trainer).
+    """Place a Gaussian on each SfM point, as `create_splats_with_optimizers` of gsplat's trainer.
 
-    Each is isotropic, with `init_scale` times the RMS distance to its three nearest neighbours as
-    its scale. The quaternions are random. Band 0 of the harmonics gives the point's colour, the
-    others are 0.
+    Each Gaussian is isotropic. Its scale is `init_scale` times the RMS distance to the three
+    nearest points. The quaternions are random. Band 0 of the harmonics is the point's colour, the
+    other bands are 0.
 
     Args:
         points: [P, 3] world units.
         colors: [P, 3], 8-bit, or floats in 0..1.
         init_opacity: Opacity of every Gaussian, above 0 and below 1.
         init_scale: Factor of the scale of every Gaussian, above 0.
-        sh_degree: Highest band of the spherical harmonics that is stored, 0 to 3.
-        generator: Random generator that draws the quaternions.
+        sh_degree: Highest stored band of the spherical harmonics, 0 to 3.
+        generator: Draws the quaternions.
 
     Returns:
         P Gaussians, float32 leaf tensors that require gradients.
 
     Raises:
-        ValueError: There are fewer than 4 points, shapes do not fit, values are not finite, the
-            opacity is not above 0 and below 1, the factor is not above 0, or the degree is not 0 to
-            3.
+        ValueError: There are fewer than 4 points, shapes do not fit, values are not finite, or
+            `init_opacity`, `init_scale` or `sh_degree` is out of range.
     """
     check_degree(sh_degree)
     means = torch.as_tensor(points, dtype=torch.float32)

@@ -1,7 +1,7 @@
 """The photometric loss of 3D Gaussian Splatting: L1 and structural dissimilarity.
 
 3D Gaussian Splatting [kerbl2023, section 5.1, equation 7]: (1 - lambda) L1 + lambda D-SSIM
-with lambda = 0.2. The dissimilarity is 1 - SSIM, as in the code of that paper and in gsplat.
+with lambda = 0.2. D-SSIM is 1 - SSIM, as in the code of that paper and in gsplat.
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ __all__ = ["WINDOW", "Target", "photometric_loss", "prepare_target"]
 
 
 def prepare_target(image: Tensor, *, backend: str = "torch") -> Target:
-    """Compute the statistics of a photograph that `photometric_loss` needs.
+    """Compute the SSIM statistics of a photograph, once for all steps on it.
 
     Args:
-        image: [H, W, 3], values of range 1; a resampled photograph may leave 0..1.
+        image: [H, W, 3], values in 0..1; bicubic resampling may overshoot a little.
         backend: `torch`, `native` or `auto` (`resolve_backend`). The native backend takes float32
             on the CPU only, and gives the same bits.
 
     Returns:
-        The photograph and its statistics, of its dtype and without a graph.
+        The photograph and its statistics, of its dtype, detached from autograd.
 
     Raises:
-        ValueError: `image` is not [H, W, 3] or is smaller than the SSIM window, or for the native
-            backend it is not float32 on the CPU.
+        ValueError: `image` is not [H, W, 3] or is smaller than the SSIM window, or the backend is
+            native and `image` is not float32 on the CPU.
     """
     if image.ndim != 3 or image.shape[2] != 3:
         raise ValueError(f"image must be [H, W, 3], got {list(image.shape)}")
@@ -52,28 +52,27 @@ def photometric_loss(
     """Return `l1 * mean |image - target| + ssim * (1 - SSIM(image, target))`.
 
     gsplat's trainer has l1 0.8 and ssim 0.2 (`ssim_lambda` of `examples/simple_trainer.py`). The
-    SSIM is averaged over the pixels that the whole window fits around.
+    SSIM is averaged over the windows that lie inside the image.
 
-    With `pixel_weight`, the absolute difference and 1 - SSIM of each pixel (of a window: its centre
-    pixel) are multiplied by the pixel's weight before the two means are taken. The sums are not
-    divided by the weights: a weight of w everywhere gives w times the loss.
+    `pixel_weight` multiplies the absolute difference of each pixel, and 1 - SSIM of the window
+    centred on it, before the two means are taken. The weights are not normalised: a weight of w
+    everywhere gives w times the loss.
 
     Args:
         image: [H, W, 3] render, of the target's dtype.
-        target: The photograph that the render is compared with.
+        target: The photograph, from `prepare_target`.
         l1: Weight of the absolute difference.
         ssim: Weight of the structural dissimilarity.
         pixel_weight: [H, W]; None weighs all pixels 1.
         backend: `torch`, `native` or `auto` (`resolve_backend`). The native backend takes float32
-            on the CPU only, and has a gradient with respect to `image` alone.
+            on the CPU only, and differentiates only with respect to `image`.
 
     Returns:
         A scalar.
 
     Raises:
-        ValueError: `image` does not have the target's shape, `pixel_weight` is not of its size, or
-            for the native backend one of them is not float32 on the CPU, or `pixel_weight` requires
-            a gradient.
+        ValueError: `image` or `pixel_weight` does not have the target's size; or the backend is
+            native, and a tensor is not float32 on the CPU or `pixel_weight` requires a gradient.
     """
     if image.shape != target.image.shape:
         raise ValueError(

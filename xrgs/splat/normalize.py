@@ -1,11 +1,11 @@
-"""Normalisation of a scene's world, for which learning rates and thresholds are written.
+"""Normalisation of a scene's world, which learning rates and thresholds assume.
 
 The method of gsplat's `examples/datasets/normalize.py`: a similarity from the cameras (up is -y,
-the point they look at is the origin, the median camera is at distance 1), then a rotation to the
-principal axes of the points (z is the thinnest). Everything is numpy float64, as SfM's output is.
+the point they look at is the origin, their median distance from it is 1), then a rotation to the
+principal axes of the points (z is the thinnest). All arrays are float64, as the output of SfM.
 
-As in gsplat, medians are taken coordinate by coordinate, and the focus is found from the world's
-origin. So the result does not depend on the scale of the world, but on its origin.
+As in gsplat, medians are taken coordinate by coordinate, and the focus is the point of each optical
+axis nearest to the world's origin. So the result depends on the world's origin, not on its scale.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 SCALE_MARGIN = 1.1
-"""The scene's scale is the cameras' extent times this, as in gsplat's trainer."""
+"""The scene's scale is the extent of the cameras times this factor, as in gsplat's trainer."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class NormalizedScene:
 
 
 def normalize_scene(viewmats: Array, points: Array) -> NormalizedScene:
-    """Normalise cameras and points together: images of both worlds are the same.
+    """Normalise cameras and points together, so that the cameras' images stay the same.
 
     Args:
         viewmats: [C, 4, 4] world to camera, rigid.
@@ -73,15 +73,15 @@ def camera_positions(viewmats: Array) -> Array:
 def similarity_from_cameras(viewmats: Array) -> Array:
     """Return the similarity that turns the cameras' mean up axis to -y and moves their focus to 0.
 
-    The focus is the median, over the cameras, of the point of the optical axis nearest to the
-    origin after the turn, as in gsplat's `center_method="focus"`. The median distance of the
-    cameras from the focus becomes 1.
+    Each camera's point is the one on its optical axis nearest to the origin, after the turn. The
+    focus is the median of these points, as in gsplat's `center_method="focus"`. The median distance
+    of the cameras from the focus becomes 1.
 
     Args:
         viewmats: [C, 4, 4] world to camera, rigid.
 
     Returns:
-        [4, 4]
+        [4, 4] from the old world to the new one.
     """
     up = -viewmats[:, 1, :3].mean(axis=0)
     turn = rotation_between(up / np.linalg.norm(up), np.array([0.0, -1.0, 0.0]))
@@ -114,9 +114,9 @@ def rotation_between(start: Array, end: Array) -> Array:
 
 
 def principal_axes(points: Array) -> Array:
-    """Return the rigid transform [4, 4] of points [P, 3] to their principal axes.
+    """Return the rigid transform [4, 4] that aligns points [P, 3] with their principal axes.
 
-    It moves the median to 0 and turns the axis of the largest variance to x, of the smallest to z.
+    The median moves to 0, the axis of the largest variance to x, that of the smallest to z.
     """
     centre = np.median(points, axis=0)
     _, vectors = np.linalg.eigh(np.cov(points - centre, rowvar=False))

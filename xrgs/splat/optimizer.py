@@ -1,4 +1,4 @@
-"""Adam over the six parameters of the Gaussians, whose state follows as Gaussians come and go."""
+"""Adam for the six parameters of the Gaussians; its state follows added and removed Gaussians."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from xrgs.splat.settings import NOMINAL_STEPS, OptimizerSettings
 
 _MOMENTS = ("exp_avg", "exp_avg_sq")
 LENGTH_GROUPS = ("scales", "quats", "sh0", "shN")
-"""The parameters whose rates `length_power` fits to the length of a run. Means have a schedule of
-their own, and a logit opacity moves far enough at gsplat's rate of 0.05."""
+"""The parameters whose rates `length_power` scales by the length of the run. Not `means`, which
+have their own schedule, nor `opacities`: gsplat's rate of 0.05 moves logits far enough."""
 
 
 class SplatOptimizer:
@@ -27,42 +27,41 @@ class SplatOptimizer:
 
         rate(t) = means * scene_scale * means_final^(max(0, t - t0) / (steps - t0))
 
-    where t0 is `means_decay_from * steps / 30,000`, 0 in gsplat. DashGaussian [chen2025dash] lets
-    the decay wait while it trains at a reduced resolution.
+    where t0 is `means_decay_from * steps / 30,000`, 0 in gsplat. DashGaussian [chen2025dash] starts
+    the decay later, after its steps at a reduced resolution.
 
-    gsplat's rates are meant for 30,000 steps. Adam moves a log scale by about its rate at each
-    step, so that 600 steps at 0.005 change a scale by at most a factor of e^3, and the first
-    scales, the spacing of the SfM points, are often ten times too large. With `length_power` of p,
-    the rates of scales, quats, sh0 and shN in a run of T steps, T below 30,000, are
+    gsplat's rates are meant for 30,000 steps. Adam moves a log scale by at most about its rate at
+    each step, so 600 steps at 0.005 change a scale by at most a factor of e^3. The initial scales,
+    from the spacing of the SfM points, are often ten times too large. With `length_power` of p, the
+    rates of scales, quats, sh0 and shN in a run of T steps, T below 30,000, are
 
         rate(t) = rate * (30,000 / T)^(p * min(1, (T - t) / (T - t1)))
 
-    where t1 is `length_decay_from * T / 30,000`: larger up to t1, then falling exponentially to
-    gsplat's own after the last step, so that the noise of large steps settles. From 30,000 steps
-    on the factor is one. Our choice: a random walk of T steps gets as far as rate * sqrt(T), which
-    p = 0.5 keeps. reports/rates compares powers.
+    where t1 is `length_decay_from * T / 30,000`. They are constant up to t1, then fall
+    exponentially and reach gsplat's rates after the last step, so that the noise of large steps
+    settles. In runs of 30,000 steps or more they are gsplat's. Our choice: a random walk of T steps
+    gets as far as rate * sqrt(T), which p = 0.5 keeps constant. reports/rates compares powers.
 
-    With `shN_every` of k, the harmonics above band 0 move at every k-th step alone, the first one
-    included, by the gradient of that step, and at k times their rate. Their moments are updated at
-    these steps alone. Our choice: the gradients of the other steps are never computed, and the rate
-    has the factor k. Adam's steps do not depend on the size of the gradient, so that a coefficient
-    with a gradient of constant sign goes as far as with k = 1.
+    With `shN_every` of k, shN and its moments are updated only at every k-th step, starting with
+    the first, by the gradient of that step and at k times the rate. Our choice: it saves computing
+    the gradients of the other steps. Adam's steps do not depend on the size of the gradient, so a
+    coefficient with a gradient of constant sign moves as far as with k = 1.
 
-    Gaussians are added and removed through `append` and `keep` alone, so that parameters and state
+    Gaussians are added and removed only through `append` and `keep`, so that parameters and state
     always fit. New Gaussians start with moments of zero and the step count of the others, as in
     gsplat (`strategy/ops.py`).
 
-    `torch.optim.Adam` gives the same, but the first one of a process imports torch's compiler,
-    which takes more than a second of a cell.
+    `torch.optim.Adam` gives the same, but its first use in a process imports torch's compiler,
+    which takes more than a second.
 
     Attributes:
-        adam: Adam's state of each parameter by the names of torch: `step` [], `exp_avg` and
+        adam: Parameter name -> its Adam state with torch's names: `step` [], `exp_avg` and
             `exp_avg_sq` [N, ...]; empty before the parameter's first step.
         backend: `torch`, `native` or `gsplat`: the backend that computes a step.
         gaussians: The optimized Gaussians.
-        rates: The present learning rate of each parameter.
+        rates: Parameter name -> learning rate of the next step.
         settings: Learning rates at the start, and Adam's constants.
-        steps_done: Number of training steps so far, with the steps that `skip_step` counted.
+        steps_done: Number of training steps so far, including those of `skip_step`.
     """
 
     def __init__(
@@ -74,16 +73,15 @@ class SplatOptimizer:
         steps: int,
         backend: str = "torch",
     ) -> None:
-        """Start with no state.
+        """Start without Adam state.
 
         Args:
-            gaussians: The Gaussians to optimize, whose tensors are replaced as Gaussians come and
-                go.
+            gaussians: The Gaussians to optimize. Adding or removing some replaces their tensors.
             settings: Learning rates and Adam's constants.
             scene_scale: Extent of the scene in world units, above 0.
             steps: Number of steps of the whole run, at least 1.
-            backend: `torch`, `native`, `gsplat` or `auto` (`resolve_backend`), which computes the
-                steps.
+            backend: Backend that computes the steps: `torch`, `native`, `gsplat` or `auto`
+                (`resolve_backend`).
 
         Raises:
             ValueError: `scene_scale` or `steps` is not above 0, or a setting is out of its range.
@@ -120,15 +118,16 @@ class SplatOptimizer:
         self.adam: dict[str, dict[str, Tensor]] = {name: {} for name in PARAMETERS}
 
     def step(self, camera: Camera | None = None, *, sh_degree: int = 0) -> None:
-        """Move every parameter that has a gradient, then decay the rate of `means`.
+        """Update every parameter that has a gradient, then set the rates of the next step.
 
-        With a camera, shN moves too, at every `shN_every`-th step, by the gradient that sh0's
-        implies. Seen from one place, a Gaussian has one colour c, which is linear in its harmonics:
+        With a camera, shN is updated too, at every `shN_every`-th step; its gradient follows from
+        that of sh0. Seen from one camera, a Gaussian has one colour c, linear in its harmonics:
         d c / d shN[k] = basis[k](dir) and d c / d sh0 = C0. So the gradient of shN[k] is the
         gradient of sh0 times basis[k](dir) / C0.
 
         Args:
-            camera: The view that the gradients come from, as the Gaussians were rendered in it.
+            camera: The rendered view that the gradients come from. None leaves shN as it is, unless
+                shN has a gradient.
             sh_degree: Highest band of the spherical harmonics that was rendered.
         """
         implementation("optimizer", self.backend).step(
@@ -147,13 +146,13 @@ class SplatOptimizer:
 
     @property
     def moves_harmonics(self) -> bool:
-        """Whether the next step moves shN."""
+        """Whether the next step updates shN."""
         return self.steps_done % self.settings.shN_every == 0
 
     def skip_step(self) -> None:
-        """Count a training step and decay the rate of `means`, but move nothing.
+        """Count a training step and set the next rates, without an update.
 
-        Adam's moments and the number of its steps stay as they are.
+        Adam's moments and step counts stay as they are.
         """
         self.steps_done += 1
         self._set_rates()
@@ -176,26 +175,28 @@ class SplatOptimizer:
             self.gaussians[name].grad = None
 
     def state_bytes(self) -> int:
-        """Return the number of bytes of Adam's state."""
+        """Return the size of Adam's state, bytes."""
         return sum(value.nbytes for state in self.adam.values() for value in state.values())
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the state that `load_state_dict` continues from.
+        """Return the state for a checkpoint.
 
         Returns:
-            `gaussians`: the parameters by name; `adam`: the state of each parameter by name, empty
-            where it has none; `steps_done`.
+            `gaussians`: name -> parameter; `adam`: name -> Adam state, empty before the first step
+            of the parameter; `steps_done`.
         """
         values = {name: self.gaussians[name].detach() for name in PARAMETERS}
         adam = {name: dict(self.adam[name]) for name in PARAMETERS}
         return {"gaussians": values, "adam": adam, "steps_done": self.steps_done}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore Gaussians, of any number, moments and learning rates; drop gradients.
+        """Restore Gaussians, moments and learning rates; drop gradients.
+
+        The number of Gaussians may differ from the present one.
 
         Raises:
             KeyError: A parameter or moment is missing.
-            ValueError: A parameter or moment has another shape or type; nothing is changed.
+            ValueError: A parameter or moment has the wrong shape or type. Nothing is changed then.
         """
         values, adam = state["gaussians"], state["adam"]
         count = len(values["means"])
@@ -218,7 +219,7 @@ class SplatOptimizer:
         self._set_rates()
 
     def keep(self, index: Tensor) -> None:
-        """Remove all other Gaussians, with their moments.
+        """Keep only the Gaussians of `index`, with their moments.
 
         Args:
             index: The Gaussians to keep: [N] bool, or [M] int64 indices in their new order.
@@ -226,12 +227,12 @@ class SplatOptimizer:
         if index.dtype == torch.bool:
             index = index.nonzero()[:, 0]
         for name in PARAMETERS:
-            # `index_select` copies whole rows, in a third of the time of `[index]`.
+            # `index_select` copies whole rows: it takes a third of the time of `[index]`.
             values = self.gaussians[name].detach().index_select(0, index)
             self._replace(name, values, lambda moment: moment.index_select(0, index))
 
     def append(self, new: Mapping[str, Tensor]) -> None:
-        """Add Gaussians behind the present ones, with moments of zero.
+        """Append Gaussians, with moments of zero.
 
         Args:
             new: Raw parameters [M, ...] for each name of `PARAMETERS`.
@@ -246,11 +247,11 @@ class SplatOptimizer:
             self._replace(name, longer, lengthen)
 
     def reset(self, name: str, value: Tensor) -> None:
-        """Give the parameter `name` new values [N, ...] and moments of zero."""
+        """Set the values [N, ...] of the parameter `name`, and its moments to zero."""
         self._replace(name, value, torch.zeros_like)
 
     def forget(self, index: Tensor) -> None:
-        """Give the Gaussians `index` [M] moments of zero in every parameter."""
+        """Set all moments of the Gaussians `index` [M] to zero."""
         for name in PARAMETERS:
             for key in self.adam[name].keys() & _MOMENTS:
                 self.adam[name][key][index] = 0

@@ -1,4 +1,4 @@
-"""Rendering: Gaussians and a camera in, an image out, on any backend."""
+"""Rendering of Gaussians into an image, on any backend."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from xrgs.splat.settings import RasterSettings
 from xrgs.splat.sh import check_sh_degree
 from xrgs.splat.torch_defaults import on_cpu_in_float32
 
-#: Shape of one Gaussian's value; the shape of shN depends on the number of bands.
+#: Parameter -> shape for one Gaussian. The shape of shN depends on the number of bands.
 _SHAPES: dict[str, tuple[int, ...]] = {
     "means": (3,),
     "quats": (4,),
@@ -31,20 +31,20 @@ _CPU = torch.device("cpu")
 
 @dataclass(frozen=True)
 class Render:
-    """A rendered image, and the work and memory that it took."""
+    """A rendered image, and the work and memory of rendering it."""
 
     image: Tensor
     """[H, W, 3], 0 and up: not clamped at 1."""
     alpha: Tensor
     """[H, W], 1 - transmittance."""
     visible: Tensor
-    """[N] bool, whether each Gaussian has a pixel in the image."""
+    """[N] bool, whether each Gaussian reaches the image (`rasterize_parameters`)."""
     evaluations: int
-    """Number of (pixel, Gaussian) pairs whose alpha was computed."""
+    """Number of computed alphas: (pixel, Gaussian) pairs."""
     buffer_bytes: int
-    """Peak bytes that the renderer allocates beside the parameters and their gradients."""
+    """Peak memory of the renderer without parameters and their gradients, bytes."""
     tile_evaluations: int
-    """`evaluations` if every pixel of a tile met every Gaussian in the tile's list."""
+    """What `evaluations` would be if every pixel evaluated every Gaussian of its tile's list."""
 
 
 @on_cpu_in_float32
@@ -58,26 +58,26 @@ def rasterize(
 ) -> Render:
     """Render Gaussians into one view.
 
-    The render is differentiable in all six parameters of the Gaussians. `Gaussians` holds natural
-    logarithms of scales and logits of opacities, which are activated here.
+    The render is differentiable in all six parameters of the Gaussians. The activation functions
+    of scales and opacities are applied here.
 
     Args:
-        gaussians: The N Gaussians, in raw parameters.
+        gaussians: The N Gaussians, as raw parameters.
         camera: The pinhole camera of the view.
         settings: How Gaussians become pixels; None takes the defaults of `RasterSettings`.
-        sh_degree: Highest band of the spherical harmonics that is evaluated, 0 to 3; None takes all
-            bands that are stored, up to `settings.sh_degree`.
-        backend: `native`, `torch`, `gsplat` (on a GPU), or `auto`: native for float32 where the
+        sh_degree: Highest evaluated band of the spherical harmonics, 0 to 3; None takes all stored
+            bands, up to `settings.sh_degree`.
+        backend: `native`, `torch`, `gsplat` (on a GPU), or `auto`: native for float32 if the
             extension was built, else torch.
 
     Returns:
-        The render, with `image` [H, W, 3], which starts at 0 and is not clamped at 1, `alpha`
-        [H, W] in 0..1, and `visible` [N] bool.
+        The render, with `image` [H, W, 3] (at least 0, not clamped at 1), `alpha` [H, W] in 0..1,
+        and `visible` [N] bool.
 
     Raises:
         ValueError: A parameter has a wrong shape or type, or values that are not finite, or
-            `sh_degree` is above the bands that are stored. The message names the parameter.
-        XrgsError: The backend is named and can't be used on this machine (`resolve_backend`).
+            `sh_degree` is above the stored bands. The message names the parameter.
+        XrgsError: The named backend can't be used on this machine (`resolve_backend`).
 
     Examples:
         >>> render = rasterize(gaussians, camera)
@@ -94,7 +94,7 @@ def rasterize(
         sh_degree = min(settings.sh_degree, stored)
     return rasterize_parameters(
         *gaussians.raw()[:-1],
-        gaussians.shN,  # which `raw` cuts off from its gradient
+        gaussians.shN,  # `raw` returns shN detached
         camera,
         settings,
         sh_degree=sh_degree,
@@ -133,22 +133,22 @@ def rasterize_parameters(
         shN: [N, K - 1, 3] coefficients of the higher bands.
         camera: The view.
         settings: How Gaussians become pixels.
-        sh_degree: Highest band that is on, at most the bands of shN.
-        means2d_offset: [N, 2] px, added to the projected means: its gradient is the image-plane
-            gradient that densification reads (with `settings.absgrad`, of absolute values).
-        raw: Whether scales and opacities are raw parameters. The native backend activates them as
-            it reads them, with the bits of `Gaussians.activated` and in less time.
+        sh_degree: Highest band that is on, at most the highest band of shN.
+        means2d_offset: [N, 2] px, added to the projected means. Its gradient is the image-plane
+            gradient for densification (with `settings.absgrad`, the sum of absolute values).
+        raw: Whether scales and opacities are raw parameters. The native backend activates them
+            while reading, faster than `Gaussians.activated` and with the same bits.
         backend: `torch`, `native`, `gsplat` or `auto` (`resolve_backend`).
 
     Returns:
-        The render, differentiable in every float argument. On the native backend it is
-        differentiable once, and its backward pass raises ValueError where a gradient is not finite
+        The render, differentiable in every float tensor. On the native backend it is differentiable
+        once, and its backward pass raises ValueError if a gradient is not finite
         (`native.rasterizer.render`).
 
     Raises:
-        ValueError: A parameter has the wrong shape or type, or values that are not finite or out
-            of range; `sh_degree` is not 0 to 3, or above the bands of shN; or shN has more than 15
-            coefficients. The message names the parameter.
+        ValueError: A parameter has the wrong shape or type, or values that are not finite or out of
+            range; `sh_degree` is not 0 to 3, or above the highest band of shN; or shN has more than
+            15 coefficients. The message names the parameter.
         MemoryError: The tile lists of the view do not fit in memory.
     """
     gaussians = ActivatedGaussians(means, quats, scales, opacities, sh0, shN)
@@ -165,35 +165,39 @@ def rasterize_parameters(
 
 
 def zero_means2d_offset(count: int, device: torch.device = _CPU) -> Tensor:
-    """Return a `means2d_offset` of zeros that gathers the image-plane gradient of N Gaussians.
+    """Return a zero `means2d_offset`, whose `grad` becomes the image-plane gradient.
+
+    Args:
+        count: The number of Gaussians, N.
+        device: Device of the Gaussians.
 
     Returns:
-        [N, 2] leaf that requires a gradient, float32. All its elements are one number in memory:
-        the native backend knows them for zeros and does not read them.
+        [N, 2] float32 leaf that requires a gradient. All its elements share one number in memory,
+        by which the native backend recognises the zeros and skips reading them.
     """
     return _zero(device).expand(count, 2).requires_grad_()
 
 
 def is_zero_offset(offset: Tensor | None) -> bool:
-    """Whether an offset is one that `zero_means2d_offset` has made."""
+    """Whether an offset was made by `zero_means2d_offset`."""
     return offset is not None and offset.data_ptr() == _zero(offset.device).data_ptr()
 
 
 @cache
 def _zero(device: torch.device) -> Tensor:
-    """All elements of every offset that `zero_means2d_offset` makes on a device."""
+    """Return the zero that all offsets of `zero_means2d_offset` on a device share."""
     return torch.zeros((), dtype=torch.float32, device=device)
 
 
 def backend_for(means: Tensor, backend: str) -> str:
-    """Choose the backend that can render parameters of this floating type.
+    """Choose the backend for Gaussians of this floating type.
 
     Args:
-        means: [N, 3] any parameter of the Gaussians.
+        means: Any parameter of the Gaussians.
         backend: `native`, `torch`, `gsplat` or `auto`.
 
     Returns:
-        `backend`; for `auto` and another type than float32, `torch`.
+        `backend`, except for `auto` and a type other than float32: `torch`.
 
     Raises:
         ValueError: The tensor is on another device than the backend's.
@@ -206,7 +210,7 @@ def backend_for(means: Tensor, backend: str) -> str:
 
 
 def _check_harmonics(gaussians: Gaussians) -> None:
-    """Check the harmonics of all Gaussians: the kernels read those only that are drawn."""
+    """Check that all harmonics are finite; the kernels check only those of visible Gaussians."""
     for name in ("sh0", "shN"):
         value = getattr(gaussians, name).detach()
         if not value.sum().isfinite() and not torch.isfinite(value).all():

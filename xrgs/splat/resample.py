@@ -1,4 +1,4 @@
-"""Differentiable resampling of images: the projection phi between HR and LR (paper 5.6)."""
+"""Differentiable resampling of images: the projection phi from HR to LR (paper, section 5.6)."""
 
 from __future__ import annotations
 
@@ -17,30 +17,30 @@ def resize(
 ) -> Tensor:
     """Resample an image to another size with an antialiased bicubic filter, unclamped.
 
-    With `variances`, the image is blurred first, by the discrete analogue of a Gaussian
-    [lindeberg1990] for each axis. It has this variance to the last digit however small that is, and
-    becomes a sampled Gaussian where it is large. Borders reflect the image.
+    With `variances`, the image is blurred first along each axis, by the discrete analogue of a
+    Gaussian [lindeberg1990]. Its variance is exact even far below 1 px^2, where a sampled Gaussian
+    is inaccurate. The image is reflected at the borders.
 
-    The result is torch's `interpolate(mode="bicubic", antialias=True)` to rounding, computed as a
-    product with one matrix for each axis: forward and backward take a quarter of the time of
+    The result is torch's `interpolate(mode="bicubic", antialias=True)` to rounding. It is computed
+    as a product with one matrix for each axis: forward and backward take a quarter of the time of
     `interpolate`, and a fortieth on the native backend.
 
     Args:
         image: [H, W, 3], of any strides.
         height: Height of the result, px.
         width: Width of the result, px.
-        variances: [2] variances of the blur down and across, px^2 of `image`, at least 0; None does
+        variances: [2] variances of the blur along y and x, px^2 of `image`, at least 0; None does
             not blur.
         backend: `torch`, `native` or `auto` (`resolve_backend`). The native backend takes float32
             on the CPU only.
 
     Returns:
-        [height, width, 3]. Differentiable in `image` and `variances`; once only on the native
-        backend.
+        [height, width, 3]. Differentiable in `image` and `variances`, on the native backend only
+        once.
 
     Raises:
-        ValueError: `image` is not [H, W, 3], has no pixel or is not float32 on the CPU for the
-            native backend, or a size is below 1.
+        ValueError: `image` is not [H, W, 3] or has no pixel, a size is below 1, or the backend is
+            native and `image` is not float32 on the CPU.
     """
     if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
         raise ValueError(f"image must be [H, W, 3] with H and W above 0, got {list(image.shape)}")

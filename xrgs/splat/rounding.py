@@ -1,8 +1,8 @@
-"""Roots, means and norms that do not depend on the processor or on the number of threads.
+"""Roots, means and norms with the same bits on every processor and for any number of threads.
 
-The last digits of torch's roots depend on the processor, and the last digits of its sums on the
-number of threads as well. The functions below compute in double, where only digits that float32
-does not hold depend on them, and round to the type of their argument.
+The last digits of torch's roots depend on the processor, and those of its sums also on the number
+of threads. The functions below compute in double, where only digits below float32's precision
+differ, and round to the dtype of the argument.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ def rounded_mean(values: Tensor) -> float:
 
 
 def rounded_norm(values: Tensor) -> float:
-    """Return the root of the sum of the squares of all values."""
+    """Return the Euclidean norm of all values."""
     norm = torch.linalg.vector_norm(values.detach(), dtype=torch.float64)
     rounded: float = norm.to(values.dtype).item()
     return rounded

@@ -2,7 +2,7 @@
 
 The defaults are from `examples/simple_trainer.py` and `strategy/default.py`. This module does not
 import torch, so that planning is quick. Step counts are for a run of 30,000 steps;
-`DensifySettings.scaled` shrinks them with the run, as the trainer's `adjust_steps` does.
+`DensifySettings.scaled` adapts them to shorter runs, as the trainer's `adjust_steps` does.
 """
 
 from __future__ import annotations
@@ -11,27 +11,28 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 NOMINAL_STEPS = 30_000
-"""Length of the run that step counts in settings are written for."""
+"""Length of the run, in steps, that all step counts in settings refer to."""
 
 SSIM_WINDOW = 11
-"""The side of the window of SSIM in the training loss, px; an image must not be smaller."""
+"""Side of the SSIM window in the training loss, px. Training images must be at least as large."""
 
 KEPT_BYTES = 264 * 2**20
-"""The most bytes of moments that training keeps of its photographs (`Target`): of 63 photographs of
-504 x 378 px, or of 15 of 1,008 x 756 px. Those of others are computed at every step on them."""
+"""Largest memory for the cached SSIM statistics of photographs (`Target`), bytes: enough for 63
+photographs of 504 x 378 px or 15 of 1,008 x 756 px. Others are computed anew at every step."""
 
 STRATEGIES = ("default", "mcmc")
-"""The strategies of densification, by the names of gsplat's (`xrgs.training.loop`)."""
+"""Names of the densification strategies, as in gsplat (`xrgs.training.loop`)."""
 
 STARTS = ("sfm", "dense")
-"""What training starts from: the SfM points, or also surfaces (`xrgs.training.dense`)."""
+"""Where the first Gaussians are placed: on the SfM points, or also on surfaces from stereo
+matching (`xrgs.training.dense`)."""
 
 SPLITS = ("random", "long_axis")
 """The values of `DensifySettings.split`."""
 
 
 def off_by_default(value: Any) -> Any:
-    """Declare a setting with a default that changes nothing; identities leave it out there."""
+    """Declare a setting whose default means "off". At its default it is in no cell's id."""
     return field(default=value, metadata={"off": value})
 
 
@@ -47,32 +48,33 @@ class RasterSettings:
     sh_degree: int = 3
     """Highest band of the spherical harmonics, 0 to 3."""
     near: float = 0.01
-    """Gaussians whose depth (world units along z) is this or less are not rendered."""
+    """Gaussians at this depth or nearer are not rendered, world units along z."""
     eps2d: float = 0.3
     """Variance added to every projected Gaussian, px^2."""
     alpha_min: float = 1.0 / 255.0
     """Contributions to a pixel whose alpha is below this are skipped."""
     alpha_max: float = 0.99
-    """Cap of a contribution's alpha; the gradient is zero where it is capped (gsplat 1.6; 0.999 in
-    1.5.3)."""
+    """Cap of a contribution's alpha, with a zero gradient where it caps: gsplat 1.6's value (1.5.3
+    has 0.999)."""
     transmittance_min: float = 1e-4
-    """A pixel ends before the Gaussian that would leave it this transmittance or less."""
+    """Compositing of a pixel ends before the Gaussian that would reduce its transmittance to this
+    or less."""
     antialiased: bool = off_by_default(False)
     """Compensate the opacity for `eps2d`, as the 2D Mip filter of Mip-Splatting [yu2024] does."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Colour behind the last Gaussian."""
     absgrad: bool = off_by_default(False)
-    """Make the gradient of `means2d_offset` the sum, for each axis, of the absolute values of the
-    pixels' gradients, so that pixels which pull a Gaussian apart do not cancel (AbsGS
-    [ye2024absgs]; gsplat's `absgrad`)."""
+    """Sum absolute values of the pixels' gradients, for each axis, into the gradient of
+    `means2d_offset`, so that opposite gradients do not cancel (AbsGS [ye2024absgs]; gsplat's
+    `absgrad`)."""
 
 
 @dataclass(frozen=True)
 class CullingOptions:
-    """Which work without effect the native rasterizer skips; off in measurements alone.
+    """Which work the native rasterizer skips because it can't change the image.
 
-    A Gaussian's ellipse is where its alpha is at least `alpha_min`. The image does not depend on
-    these options, to rounding at the cut-offs.
+    Only benchmarks switch options off. A Gaussian's ellipse is where its alpha is at least
+    `alpha_min`. Apart from rounding at the cut-offs, the image does not depend on these options.
     """
 
     out_of_view: bool = True
@@ -84,17 +86,17 @@ class CullingOptions:
     blocks: bool = True
     """Skip 4x4 px blocks of a tile that the ellipse does not overlap."""
     saturated: bool = True
-    """Skip Gaussians behind the last one that any pixel of a block composites."""
+    """Skip Gaussians behind the last one that a pixel of the block composites."""
 
 
 @dataclass
 class OptimizerSettings:
-    """Adam's learning rates, one for each parameter, and its constants."""
+    """Adam's learning rate for each parameter, and its constants."""
 
     means: float = 1.6e-4
-    """Multiplied by the scene's scale; decays exponentially from the first step to the last."""
+    """Rate of means at the first step, times the scene's scale; it decays exponentially."""
     means_final: float = 0.01
-    """The rate of means after the last step, as a share of the first."""
+    """Rate of means after the last step, as a fraction of the first rate."""
     means_decay_from: int = 0
     """Step of a 30,000-step run at which the rate of means begins to decay; 0 is gsplat's."""
     scales: float = 5e-3
@@ -105,10 +107,10 @@ class OptimizerSettings:
     sh0: float = 2.5e-3
     shN: float = 2.5e-3 / 20  # noqa: N815
     shN_every: int = 1  # noqa: N815
-    """Steps of this run between two steps of shN, whose rate is multiplied by it; 1 is gsplat's."""
+    """Steps between two updates of shN, whose rate is multiplied by this; 1 in gsplat."""
     length_power: float = off_by_default(0.0)
-    """The rates of scales, quats, sh0 and shN are multiplied by (30,000 / steps) to this power
-    (`SplatOptimizer`); 0 to 1. 0 keeps gsplat's, and so does a run of 30,000 steps and more."""
+    """Power p, 0 to 1: in runs below 30,000 steps, the rates of scales, quats, sh0 and shN are
+    multiplied by (30,000 / steps)^p (`SplatOptimizer`). 0 keeps gsplat's rates."""
     length_decay_from: int = off_by_default(18_000)
     """Step of a 30,000-step run at which these rates begin to fall to gsplat's. Our choice."""
     beta1: float = 0.9
@@ -123,10 +125,11 @@ class OptimizerSettings:
 class DensifySettings:
     """When Gaussians are grown, pruned and reset (gsplat's `DefaultStrategy` and `MCMCStrategy`).
 
-    `MCMCStrategy` reads `start`, `stop`, `every`, `prune_opacity`, `budget` and `noise` alone.
+    `MCMCStrategy` reads only `start`, `stop`, `every`, `prune_opacity`, `budget` and `noise`.
 
-    A step that is a multiple of `every`, above `start` and below `stop` refines; one that is a
-    multiple of `reset_every`, above 0 and below `stop`, resets opacities if `resets` is true.
+    Gaussians are refined at steps above `start` and below `stop` that are a multiple of `every`.
+    Opacities are reset at steps above 0 and below `stop` that are a multiple of `reset_every`, if
+    `resets` is true.
     """
 
     start: int = 500
@@ -134,34 +137,34 @@ class DensifySettings:
     every: int = 100
     reset_every: int = 3_000
     resets: bool = off_by_default(True)
-    """Whether opacities are reset; gsplat 1.5.3 never does (`xrgs.splat.strategy.default`)."""
+    """Whether opacities are reset; gsplat 1.5.3 never resets (`xrgs.splat.strategy.default`)."""
     grow_grad2d: float = 2e-4
-    """A Gaussian grows if the mean norm of its image-plane gradient (normalised device units) is
+    """A Gaussian grows if the mean norm of its image-plane gradient, in normalised device units, is
     above this."""
     grow_scale3d: float = 0.01
-    """Multiplied by the scene's scale: a growing Gaussian whose largest scale is above this is
-    split, otherwise duplicated."""
+    """A growing Gaussian is split if its largest scale is above this times the scene's scale, else
+    duplicated."""
     prune_opacity: float = 0.005
     """A Gaussian is pruned if its opacity is below this."""
     prune_scale3d: float = 0.1
-    """Multiplied by the scene's scale: a Gaussian whose largest scale is above this is pruned, at
-    refinements after step `reset_every`."""
+    """At refinements after step `reset_every`, a Gaussian is pruned if its largest scale is above
+    this times the scene's scale."""
     reset_opacity: float = 2.0
-    """Multiplied by `prune_opacity`: a reset caps opacities at this."""
+    """A reset caps opacities at this times `prune_opacity`."""
     split: str = "random"
-    """How Gaussians grow. `random`: as in gsplat, small Gaussians are duplicated, and large ones
-    split into two with means drawn from the Gaussian. `long_axis`: all are split into two side by
-    side along the longest axis (`xrgs.splat.strategy.ops.split_along_longest_axis`)."""
+    """How Gaussians grow. `random`: as in gsplat, small Gaussians are duplicated and large ones
+    are split into two, with means drawn from the Gaussian. `long_axis`: all are split into two side
+    by side along the longest axis (`xrgs.splat.strategy.ops.split_along_longest_axis`)."""
     budget: float = off_by_default(0.0)
-    """The largest number of Gaussians to which growth may lead, for each pixel of the largest
-    training view (`xrgs.splat.strategy.ops.Budget`); 0 sets no limit. The unit is our choice."""
+    """Growth stops at this number of Gaussians, per pixel of the largest training view
+    (`xrgs.splat.strategy.ops.Budget`); 0 sets no limit. The unit is our choice."""
     noise: float = off_by_default(0.0)
-    """Multiplied by the learning rate of means: the size of the noise on the means that
-    `MCMCStrategy` adds at every step. gsplat's is 5e5."""
+    """Size of the noise that `MCMCStrategy` adds to the means at every step, as a multiple of the
+    learning rate of means. gsplat's is 5e5."""
 
     @property
     def last_refinement(self) -> int:
-        """The last step at which Gaussians are refined, if `start` is below it."""
+        """The last step at which Gaussians are refined (none are if it is not above `start`)."""
         return (self.stop - 1) // self.every * self.every
 
     def scaled(self, steps: int) -> DensifySettings:

@@ -1,8 +1,8 @@
 """View-dependent colour: real spherical harmonics of degree 0 to 3.
 
-The basis is the one of 3D Gaussian Splatting and of gsplat (`_spherical_harmonics` of
-`cuda/_torch_impl.py`): orthonormal, with the Condon-Shortley phase, indexed l^2 + l + m. A colour
-is the sum over bands plus 0.5, clamped at 0. Every viewer of .ply files expects the same.
+The basis is that of 3D Gaussian Splatting, of gsplat (`_spherical_harmonics` of
+`cuda/_torch_impl.py`) and of viewers of .ply files: orthonormal, with the Condon-Shortley phase,
+indexed l^2 + l + m. A colour is the sum over bands plus 0.5, clamped at 0.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 MAX_DEGREE = 3
-"""Highest degree that the basis is written out for."""
+"""Highest implemented degree."""
 C0 = 0.5 / math.sqrt(math.pi)
 """The constant basis function of band 0."""
 
@@ -24,13 +24,13 @@ def bases(degree: int) -> int:
 
 
 def check_degree(degree: int) -> None:
-    """Raise ValueError unless harmonics of degree 0 to `degree` are served: `degree` is 0 to 3."""
+    """Raise ValueError unless `degree` is 0 to 3."""
     if not 0 <= degree <= MAX_DEGREE:
         raise ValueError(f"sh_degree must be 0 to {MAX_DEGREE}, got {degree}")
 
 
 def check_sh_degree(degree: int, shN: Tensor) -> None:
-    """Raise an error unless harmonics of a degree can be evaluated from the stored coefficients.
+    """Check that the stored coefficients suffice for a degree.
 
     Args:
         degree: Highest band that is on.
@@ -98,13 +98,13 @@ def sh_to_colors(degree: int, dirs: Tensor, sh0: Tensor, shN: Tensor) -> Tensor:
     """Return the colours of Gaussians seen along given directions.
 
     Args:
-        degree: Highest band that is on; bands stored above it are left out.
+        degree: Highest band that is on; higher stored bands are ignored.
         dirs: [N, 3] from the camera to each Gaussian, of unit length.
         sh0: [N, 1, 3] coefficients of band 0.
         shN: [N, K - 1, 3] coefficients of the higher bands, K >= (degree + 1)^2.
 
     Returns:
-        [N, 3], 0 and up: not clamped at 1.
+        [N, 3], at least 0, not clamped at 1.
 
     Raises:
         ValueError: As for `check_sh_degree`.
@@ -113,13 +113,13 @@ def sh_to_colors(degree: int, dirs: Tensor, sh0: Tensor, shN: Tensor) -> Tensor:
     rest = bases(degree) - 1
     basis = sh_basis(degree, dirs)  # [N, (degree + 1)^2]
     colors = basis[:, :1] * sh0[:, 0]  # [N, 3]
-    # Also with no band on, so that shN has a gradient (0) and its Adam steps count, as in gsplat.
+    # Also at degree 0, so that shN has a gradient (0) and its Adam steps count, as in gsplat.
     colors = colors + torch.einsum("nk,nkc->nc", basis[:, 1:], shN[:, :rest])
     return (colors + 0.5).clamp_min(0.0)
 
 
 def colors_to_sh0(colors: Tensor) -> Tensor:
-    """Return the coefficients of band 0 that give colours, whatever the direction of view.
+    """Return the band 0 coefficients of colours that do not depend on the view.
 
     Args:
         colors: [N, 3] in 0..1.

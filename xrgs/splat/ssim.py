@@ -1,6 +1,6 @@
-"""The Gaussian window of the SSIM [wang2004, section III-C], and statistics under it.
+"""The Gaussian window of the SSIM [wang2004, section III-C], and mean and variance within it.
 
-The constants here are the training loss's; the compiled loss repeats them in its kernels.
+The training loss uses these constants; the compiled kernels of the loss repeat them.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from torch.nn.functional import conv2d
 from xrgs.splat.settings import SSIM_WINDOW
 
 WINDOW = SSIM_WINDOW
-"""Taps of the window along each axis."""
+"""Side of the window, px."""
 SIGMA = 1.5
 """Standard deviation of the window, px."""
 _TAPS = [math.exp(-((tap - WINDOW // 2) ** 2) / (2 * SIGMA**2)) for tap in range(WINDOW)]
 WEIGHTS = tuple(tap / math.fsum(_TAPS) for tap in _TAPS)
-"""The window's weights along an axis, which sum to 1."""
+"""Weights of the window along one axis; their sum is 1."""
 C1 = 0.01**2
 """(K1 L)^2 with K1 = 0.01, for a data range L of 1."""
 C2 = 0.03**2
@@ -29,15 +29,15 @@ C2 = 0.03**2
 
 @dataclass(frozen=True)
 class Target:
-    """A photograph and its statistics for the SSIM, which are computed once for each view."""
+    """A photograph and its SSIM statistics, which are computed once for each view."""
 
     image: Tensor  # [H, W, 3]
-    mean: Tensor  # [H - 10, W - 10, 3] under the window
-    variance: Tensor  # [H - 10, W - 10, 3] under the window, never negative
+    mean: Tensor  # [H - 10, W - 10, 3] of each window
+    variance: Tensor  # [H - 10, W - 10, 3] of each window, never negative
 
 
 def window_mean(image: Tensor) -> Tensor:
-    """Return the weighted mean of the window around each pixel that it fits around.
+    """Return the weighted mean of every window that lies inside the image.
 
     Args:
         image: [H, W, C], at least `WINDOW` px along each axis.
@@ -47,8 +47,8 @@ def window_mean(image: Tensor) -> Tensor:
     """
     channels = image.shape[-1]
     kernel = image.new_tensor(WEIGHTS)  # [11]
-    # `image[None].permute`, not `image.permute()[None]`: only then is it channels-last to oneDNN,
-    # and the depth-wise kernel five times as fast (2 threads, 504 x 378).
+    # `image[None].permute`, not `image.permute()[None]`: only then does oneDNN treat the tensor as
+    # channels-last, and its depth-wise kernel is five times as fast (2 threads, 504 x 378 px).
     planes: Tensor = image[None].permute(0, 3, 1, 2)  # [1, C, H, W]
     planes = conv2d(planes, kernel.view(1, 1, 1, -1).expand(channels, 1, 1, -1), groups=channels)
     planes = conv2d(planes, kernel.view(1, 1, -1, 1).expand(channels, 1, -1, 1), groups=channels)
@@ -57,7 +57,7 @@ def window_mean(image: Tensor) -> Tensor:
 
 
 def window_moments(image: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the mean and the variance of the window around each pixel that it fits around.
+    """Return the weighted mean and variance of every window that lies inside the image.
 
     Args:
         image: [H, W, C], at least `WINDOW` px along each axis.
@@ -65,8 +65,8 @@ def window_moments(image: Tensor) -> tuple[Tensor, Tensor]:
     Returns:
         Mean and variance, [H - 10, W - 10, C] each. A variance that rounding makes negative is 0.
     """
-    # Summed in a fixed order. A convolution's order depends on the processor, and a variance, as a
-    # difference of squares, shows that in many more digits than the last one.
+    # Summed in a fixed order. A convolution's order depends on the processor, which would change
+    # many digits of a variance, since it is a small difference of squares.
     moments = torch.cat([image, image * image], dim=-1)
     for axis in (0, 1):
         moments = _weighted_sum(moments, axis)
@@ -75,7 +75,7 @@ def window_moments(image: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _weighted_sum(image: Tensor, axis: int) -> Tensor:
-    """Return the weighted sum of the window around each place that it fits around along an axis."""
+    """Return the weighted sums along one axis of all windows that lie inside the image."""
     first, *others = WEIGHTS
     length = image.shape[axis] - WINDOW + 1
     total = image.narrow(axis, 0, length) * first

@@ -1,4 +1,4 @@
-"""The defaults of torch, which the program around us may have changed."""
+"""Independence from torch's default dtype and device, which a user's program may have changed."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ _R = TypeVar("_R")
 
 
 def on_cpu_in_float32(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """Run a function with torch's own default type and device, float32 and the CPU.
+    """Decorate a function to run with torch's defaults, float32 and the CPU.
 
-    Those of the caller, of `torch.set_default_dtype` and `torch.set_default_device`, are restored
-    afterwards. Meanwhile other threads of the process have torch's own type, too.
+    The caller's settings (`torch.set_default_dtype`, `torch.set_default_device`) are restored
+    afterwards. Meanwhile float32 is the default in other threads of the process too.
     """
 
     @wraps(function)

@@ -1,9 +1,8 @@
-"""The state of a training run on disk, from which a killed run continues to the same result.
+"""The state of a training run on disk, from which a killed run continues with the same result.
 
-Each object that the steps change returns its state by `state_dict` and takes it back by
-`load_state_dict`, as torch's modules do; a run registers them once (`Checkpoint.register`). The
-file is a .npz of plain arrays and one JSON text, so that reading a file of unknown origin runs no
-code, and so that numbers come back to the last bit.
+Each object that the steps change has `state_dict` and `load_state_dict`, as torch's modules; a run
+registers these objects once (`Checkpoint.register`). The file is a .npz of plain arrays and a JSON
+text: reading a file of unknown origin runs no code, and numbers are exact to the last bit.
 """
 
 from __future__ import annotations
@@ -30,10 +29,10 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 _JSON_MEMBER = "state.json"
-"""Member of the archive that holds everything but the tensors, as bytes of UTF-8."""
+"""Member of the archive with all values except tensors, as JSON in UTF-8."""
 
 State = dict[str, Any]
-"""Tensors and values that JSON can hold, by name; dicts of them may nest. No name contains `/`."""
+"""Name -> tensor, JSON value or another such dict. No name contains `/`."""
 
 
 class CheckpointError(XrgsError):
@@ -47,10 +46,10 @@ class Stateful(Protocol):
         """Return the state. Tensors are not copied."""
 
     def load_state_dict(self, state: State) -> None:
-        """Take over the state of an object that was built from the same config and data.
+        """Restore the state of an object that was built from the same config and data.
 
         Args:
-            state: What `state_dict` returned.
+            state: The result of `state_dict`.
 
         Raises:
             KeyError: An entry is missing.
@@ -60,14 +59,14 @@ class Stateful(Protocol):
 
 
 class Checkpoint:
-    """Writes the state of the registered objects to a file every so often, and restores it."""
+    """Writes the state of the registered objects to a file at an interval, and restores it."""
 
     def __init__(self, file: Path | None = None, cell_id: str = "", every_s: float = 0.0) -> None:
-        """Set where and how often the state is written.
+        """Set the file and the interval.
 
         Args:
             file: The checkpoint file; None writes nothing.
-            cell_id: The cell whose state it is. The file of another cell is refused.
+            cell_id: Id of the cell in training. The file of another cell is refused.
             every_s: Seconds between two writes; 0 never writes.
         """
         self.file = file
@@ -75,14 +74,14 @@ class Checkpoint:
         self.every_s = every_s
         self._objects: dict[str, Stateful] = {}
         self._loaded: State = {}
-        """States that `load` has read and no object has taken over yet."""
+        """States that `load` has read, of objects that are not registered yet."""
         self._written_at = time.monotonic()
 
     def load(self) -> int | None:
-        """Read the file; the objects take over their states when they are registered.
+        """Read the file; each object's state is restored when the object is registered.
 
         Returns:
-            The number of steps done; None where there is no file.
+            The number of steps done; None if there is no file.
 
         Raises:
             CheckpointError: The file is damaged, or belongs to another cell; the message names the
@@ -94,7 +93,7 @@ class Checkpoint:
         try:
             state = _load(self.file)
             cell_id, steps, states = state["cell"], int(state["steps"]), dict(state["states"])
-        except Exception as error:  # the bytes may be anything, and so may the error
+        except Exception as error:  # a damaged file may raise any error
             raise CheckpointError(f"{self.file}: {type(error).__name__}: {error}") from error
         if cell_id != self.cell_id:
             raise CheckpointError(f"{self.file}: belongs to cell {cell_id}, not to {self.cell_id}")
@@ -102,12 +101,12 @@ class Checkpoint:
         return steps
 
     def register(self, **objects: Stateful) -> None:
-        """Add objects whose state is written; they replace objects of the same names.
+        """Add objects whose state is written; they replace registered objects of the same names.
 
-        The objects take over the states that `load` has read, in their order.
+        States that `load` has read are restored, in the order of the objects.
 
         Args:
-            objects: Each by the name of its state in the file.
+            objects: Name of the state in the file -> object.
 
         Raises:
             CheckpointError: A state is missing or does not fit its object. The objects may be half
@@ -127,13 +126,13 @@ class Checkpoint:
     def save_if_due(self, step: int) -> float:
         """Write the file if the interval has passed.
 
-        Where the disk is full or gone, a warning is logged and training continues.
+        If the file can't be written, a warning is logged and training continues.
 
         Args:
-            step: The number of the step that is done, from 0.
+            step: Number of the last finished step, from 0.
 
         Returns:
-            The seconds that it took.
+            The time of writing, seconds.
         """
         start = time.monotonic()
         if self.file is None or self.every_s <= 0 or start - self._written_at < self.every_s:
@@ -152,7 +151,7 @@ class Checkpoint:
         return self._written_at - start
 
     def set_aside(self) -> None:
-        """Rename the file to `refused-<name>` and forget its states: training starts over."""
+        """Rename the file to `refused-<name>` and forget its states, so that training restarts."""
         self._loaded, self._objects = {}, {}
         if self.file is not None and self.file.exists():
             self.file.rename(self.file.with_name(f"refused-{self.file.name}"))
@@ -169,7 +168,7 @@ def _save(file: Path, state: State) -> None:
 
 
 def _split_off_tensors(state: State, path: str, arrays: dict[str, NDArray[Any]]) -> State:
-    """Return the values that JSON can hold; the tensors are put into `arrays` by their path."""
+    """Return the state without tensors; put these into `arrays`, with their path as the key."""
     plain: State = {}
     for name, value in state.items():
         if isinstance(value, torch.Tensor):
@@ -195,6 +194,5 @@ def _put_back_tensors(state: State, arrays: Mapping[str, NDArray[Any]]) -> None:
         inner = state
         for folder in folders:
             inner = inner[folder]
-        # Cloned into memory of torch's own alignment: the order of a vectorised sum may depend on
-        # the alignment.
+        # Cloned to get torch's memory alignment: the order of a vectorised sum may depend on it.
         inner[name] = torch.from_numpy(array).clone()

@@ -1,11 +1,10 @@
-"""Trains the baseline to as many Gaussians as another cell has: a control for claims of efficiency.
+"""Trains the baseline with the number of Gaussians of another cell, to control for that number.
 
-A method that ends with fewer Gaussians has to be better than the baseline with as few. The control
-changes one value of the baseline: `splat.densify.grow_grad2d`, the gradient above which
-densification grows a Gaussian. Training runs with one threshold, ends as soon as densification has
-stopped at too many or too few Gaussians, and starts again with another threshold. With
-`splat.strategy=mcmc` the number is the budget, and one training is enough. The paper has no such
-control.
+A method that ends with fewer Gaussians has to be better than the baseline with equally few. The
+control changes one value of the baseline: `splat.densify.grow_grad2d`, the gradient above which a
+Gaussian grows. Training runs with one threshold, ends as soon as densification has stopped at too
+many or too few Gaussians, and starts again with another threshold. With `splat.strategy=mcmc` the
+number is the budget, and one training is enough. The paper has no such control.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ _ATTEMPTS = 10
 _FIRST_POWER = 1.5
 """Assumed p of count ~ threshold^-p until two attempts have measured it."""
 _POWER_RANGE = 0.5, 5.0
-"""Bounds of the measured p; counts are noisy, and not quite monotone in the threshold."""
+"""Bounds of the measured p, since counts are noisy and not quite monotone in the threshold."""
 
 
 @on_cpu_in_float32
@@ -51,18 +50,18 @@ def train_cell(
     """Train a config: several times if count matching is on, else once.
 
     Args:
-        data: The views to train on and the points to start from.
+        data: The training views and the SfM points.
         conf: The config.
-        checkpoint: Where the state of the run is written; None writes nothing.
+        checkpoint: Saves and restores the run; None saves nothing.
         evaluate: As for `train`.
 
     Returns:
         The trained Gaussians and the record of their training.
 
     Raises:
-        CheckpointError: The state that was read does not fit this config and data.
-        XrgsError: A component's value is out of range, the components leave no view to train on,
-            or no threshold gives the number of Gaussians.
+        CheckpointError: The checkpoint does not fit this config and data.
+        XrgsError: A component's value is out of range, the components exclude every view, or no
+            threshold gives the number of Gaussians.
 
     Examples:
         >>> result = train(data, compose("+ablation=loss_weighting", "train.steps=5"))
@@ -84,15 +83,14 @@ def train_count_matched(
 ) -> TrainingResult:
     """Train until the number of Gaussians is `components.count_matched.gaussians`, above 0.
 
-    `splat.densify.grow_grad2d` is the first threshold; `splat.strategy=mcmc` has none, and takes
-    the number as its budget. The arguments are as for `train`; the checkpoint has the state of the
-    search too.
+    `splat.densify.grow_grad2d` is the first threshold. `splat.strategy=mcmc` has no threshold: the
+    number is its budget. The arguments are as for `train`; the checkpoint includes the search.
 
     Returns:
-        The result of the run that matched; its `grow_grad2d` is the threshold that was found.
+        The result of the matching run; its `grow_grad2d` is the matching threshold.
 
     Raises:
-        CheckpointError: The state that was read does not fit this config and data.
+        CheckpointError: The checkpoint does not fit this config and data.
         XrgsError: Ten thresholds or the budget gave other numbers of Gaussians, or as for `train`.
     """
     checkpoint = checkpoint or Checkpoint()
@@ -106,7 +104,7 @@ def train_count_matched(
     def train_at(threshold: float) -> TrainingResult:
         return train_with(replace(densify, grow_grad2d=threshold))
 
-    if conf.splat.strategy == "mcmc":  # its budget is the number itself
+    if conf.splat.strategy == "mcmc":  # the budget is the number of Gaussians
         try:
             budget = count_matched.gaussians / data.view_pixels
             return train_with(replace(densify, budget=budget))
@@ -123,7 +121,7 @@ def train_count_matched(
 
 
 class CountMismatchError(Exception):
-    """Densification has stopped at a number of Gaussians outside the tolerance.
+    """The number of Gaussians after densification is outside the tolerance.
 
     Attributes:
         count: The number of Gaussians.
@@ -138,7 +136,7 @@ class CountCheck(Component):
     """Ends a run once its number of Gaussians is final and outside the tolerance."""
 
     def __init__(self, target: int, tolerance: float, stop: int) -> None:
-        """Set the number of Gaussians and the step from which on it is checked.
+        """Set the number of Gaussians, and the first step that checks it.
 
         Args:
             target: Number of Gaussians, above 0.
@@ -167,13 +165,13 @@ class CountCheck(Component):
 
 
 class ThresholdSearch:
-    """Searches the threshold of densification that gives a number of Gaussians.
+    """Searches for the growth threshold that gives a number of Gaussians.
 
-    The method is a secant of log(count) over log(threshold), within the bracket of the thresholds
-    that gave too many Gaussians and too few.
+    The method is a secant of log(count) over log(threshold), bracketed by a threshold with too many
+    Gaussians and one with too few.
 
     Attributes:
-        tried: The (threshold, count) of each attempt that did not match, in order.
+        tried: (threshold, count) of each failed attempt, in order.
     """
 
     def __init__(self, start: float, target: int) -> None:
@@ -219,7 +217,7 @@ class ThresholdSearch:
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the attempts so far, from which the present threshold follows."""
+        """Return the attempts so far, which determine the next threshold."""
         return {"tried": self.tried}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -235,9 +233,9 @@ def next_threshold(tried: Sequence[tuple[float, int]], target: int) -> float:
         target: The number of Gaussians to reach.
 
     Returns:
-        The threshold at which count ~ threshold^-p through the last attempt reaches the target,
-        with p from the last two attempts. If it lies outside the bracket, the geometric mean of the
-        bracket; without a bracket, a step of 10% beyond it.
+        The threshold at which count ~ threshold^-p, fitted to the last two attempts, reaches the
+        target. If that is outside the bracket: the bracket's geometric mean, or without a bracket
+        a step of 10% from the last threshold.
     """
     low = max((threshold for threshold, count in tried if count > target), default=0.0)
     high = min((threshold for threshold, count in tried if count <= target), default=math.inf)
@@ -252,5 +250,5 @@ def next_threshold(tried: Sequence[tuple[float, int]], target: int) -> float:
         return guess
     if 0 < low < high < math.inf:
         return math.sqrt(low * high)
-    # Counts are not quite monotone in the threshold: one end of the bracket may have been wrong.
+    # Counts are not quite monotone in the threshold, so an end of the bracket may be wrong.
     return guess * 1.1 if count > target else guess / 1.1

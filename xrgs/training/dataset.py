@@ -19,31 +19,31 @@ if TYPE_CHECKING:
 
     from xrgs.mixture.views import Variant, View
 
-#: The values of `train.views`: which training views a cell uses.
+#: Allowed values of `train.views`, the training views of a cell.
 USES = ("mixed", "all_hr", "hr_only", "lr_only")
-#: HR training views that `train.validation` must leave to train on; our choice.
+#: Least number of HR training views after `train.validation` holds some out; our choice.
 _MIN_HR_LEFT = 2
 
 
 @dataclass(frozen=True)
 class LoadedView:
-    """One view in memory, with its photograph in 8 bits: a quarter of what float32 takes."""
+    """A view in memory. Its photograph has 8 bits, a quarter of the memory of float32."""
 
     name: str
     tag: str
     """`HR` or `LR`."""
     camera: Camera
     pixels: torch.Tensor
-    """[H, W, 3], uint8 as the file has them; floats are taken as they are, in 0..1."""
+    """[H, W, 3] photograph: uint8 as in the file, or floats in 0..1."""
     sampling_rate: float = 1.0
-    """The relative sampling rate in (0, 1], see `xrgs.mixture.views.View`."""
+    """Relative sampling rate in (0, 1], see `xrgs.mixture.views.View`."""
     mask: torch.Tensor | None = None
-    """[H, W] bool, True for a pixel that is used; None uses all."""
+    """[H, W] bool, True for a used pixel; None uses all."""
     supersampling: float = 1.0
-    """How many times as many px a side the view needs, see `xrgs.mixture.views.View`."""
+    """Factor of width and height to reach the finest views, see `xrgs.mixture.views.View`."""
 
     def to(self, device: str) -> LoadedView:
-        """Return the view with its photograph and mask on a device; its camera stays."""
+        """Return the view with photograph and mask on a device; the camera stays on the CPU."""
         mask = None if self.mask is None else self.mask.to(device)
         return replace(self, pixels=self.pixels.to(device), mask=mask)
 
@@ -52,33 +52,33 @@ class LoadedView:
         """The photograph [H, W, 3] in 0..1: a new float32 tensor of `pixels` / 255."""
         if self.pixels.is_floating_point():
             return self.pixels
-        return self.pixels.float().div_(255)  # in place: new memory takes longer than the division
+        return self.pixels.float().div_(255)  # in place: allocating takes longer than dividing
 
 
 @dataclass(frozen=True)
 class Dataset:
-    """What a cell trains and is evaluated on, in gsplat's normalised world."""
+    """The training and test data of a cell, in gsplat's normalised world."""
 
     train: tuple[LoadedView, ...]
     test: tuple[LoadedView, ...]
-    """The views that are scored: the variant's test views, or with `train.validation` the HR
-    training views that are held out."""
+    """The scored views: the variant's test views, or with `train.validation` the held-out HR
+    training views."""
     points: torch.Tensor
     """SfM points [P, 3], float32."""
     colors: torch.Tensor
-    """Their colours [P, 3], float32 in 0..1."""
+    """Colours of the points [P, 3], float32 in 0..1."""
     scene_scale: float
-    """The unit of the learning rate of means and of the size thresholds, see
-    `xrgs.splat.normalize`."""
+    """Extent of the scene, world units: the unit of means' learning rate and of size thresholds
+    (`xrgs.splat.normalize`)."""
     factor: int
-    """How many times fewer pixels per side the method takes LR views to have."""
+    """Size of HR views over size of LR views, as the method assumes it."""
     degradation: str = "downsample"
-    """How LR views were made of HR ones, a key of `xrgs.mixture.degradations.DEGRADATIONS`, or
-    `none` where a camera took them."""
+    """How LR views were made from HR views, a key of `xrgs.mixture.degradations.DEGRADATIONS`, or
+    `none` if a camera took them."""
 
     @property
     def view_pixels(self) -> int:
-        """The most pixels of a training view, the unit of budgets of Gaussians; 0 without views."""
+        """Number of pixels of the largest training view, for budgets; 0 without views."""
         return max((view.camera.width * view.camera.height for view in self.train), default=0)
 
 
@@ -87,29 +87,29 @@ def load(
 ) -> Dataset:
     """Read a variant's images and normalise its world.
 
-    Poses, points and world depend neither on `use` nor on `validation`: SfM has placed held-out
-    training views among the others, as it has placed test views. The controls differ from `mixed`
-    in the training views alone.
+    Poses, points and world depend neither on `use` nor on `validation`: SfM has registered all
+    views, also held-out and test views. So the controls differ from `mixed` only in the training
+    views.
 
     Args:
         variant: The frozen variant.
-        use: Which training views to load: `mixed` for all as they are, `all_hr` with the originals
-            in the place of the degraded ones, `hr_only` and `lr_only` for views of one tag.
-        validation: Share of the HR training views that are held out and scored in place of the
-            test views, which are not read then: round(validation * n) of n, at least one. 0 scores
-            the test views.
-        seed: The cell's seed, which chooses the held-out views: the seeds 0, 1, ... hold out one
-            part of the HR views after another, so that 1 / `validation` seeds are the folds of a
-            cross-validation. The choice depends on the variant, `validation` and `seed` alone.
+        use: Training views to load: `mixed` for all, `all_hr` for all with the originals instead of
+            degraded photographs, `hr_only` and `lr_only` for the views of one tag.
+        validation: Fraction of the HR training views that are held out, round(validation * n) of
+            n, at least one. They are scored instead of the test views, which are not read then. 0
+            scores the test views.
+        seed: The cell's seed, which selects the held-out views: seeds 0, 1, ... hold out one part
+            of the HR views after another, so that 1 / `validation` seeds are the folds of a
+            cross-validation. The selection depends only on the variant, `validation` and `seed`.
 
     Returns:
         The dataset, with views in the order of the variant.
 
     Raises:
-        UnreadableError: An image can't be read now.
-        ImageError: An image is missing, unreadable or not of its view's size; the message names it.
+        UnreadableError: An image can't be read at the moment.
+        ImageError: An image is missing, damaged or not of its view's size; the message names it.
         XrgsError: The variant has no such views, too few HR training views are left, or its cameras
-            and points can't be normalised; the message names the key.
+            and points can't be normalised; the message names the config's key or the variant.
     """
     scored = _held_out(variant, validation, seed) or [v for v in variant.views if v.split == "test"]
     held_out = {view.name for view in scored if view.split == "train"}
@@ -120,7 +120,7 @@ def load(
         (view.split, view.name): viewmat
         for view, viewmat in zip(posed, world.viewmats, strict=True)
     }
-    # An original has the pose of the training view that it replaces.
+    # The original of a degraded training view has the same pose.
     entries = [("train", view) for view in training] + [(view.split, view) for view in scored]
     loaded = tuple(
         _load_view(view, viewmats[split, view.name], hide=place < len(training))
@@ -138,7 +138,7 @@ def load(
 
 
 def _normalized(variant: Variant, posed: list[View]) -> NormalizedScene:
-    """Normalise the world of a variant; given poses need not be of the points' world."""
+    """Normalise the world of a variant; fails if given poses and points do not belong together."""
     try:
         with np.errstate(divide="raise", over="raise", invalid="raise"):
             return normalize_scene(np.stack([view.viewmat for view in posed]), variant.points)
@@ -148,7 +148,7 @@ def _normalized(variant: Variant, posed: list[View]) -> NormalizedScene:
 
 
 def _held_out(variant: Variant, share: float, seed: int) -> list[View]:
-    """Choose the HR training views that are scored and not trained on, in the variant's order."""
+    """Choose the held-out HR training views, in the variant's order."""
     if share == 0:
         return []
     views = [view for view in variant.views if view.split == "train" and view.tag == "HR"]
@@ -164,7 +164,7 @@ def _held_out(variant: Variant, share: float, seed: int) -> list[View]:
 
 
 def _training_views(variant: Variant, use: str) -> list[View]:
-    """Select the training views that `use` names, in the variant's order."""
+    """Select the training views for `use`, in the variant's order."""
     if use not in USES:
         raise XrgsError(f"train.views={use}: must be one of {', '.join(USES)}")
     views = [view for view in variant.views if view.split == "train"]
@@ -188,7 +188,7 @@ def _training_views(variant: Variant, use: str) -> list[View]:
 
 
 def _load_view(view: View, viewmat: NDArray[np.float64], *, hide: bool) -> LoadedView:
-    """Load a view; with `hide`, what is outside its mask is not loaded (`masks.filled`)."""
+    """Load a view; with `hide`, pixels outside its mask are replaced (`masks.filled`)."""
     camera = Camera(
         viewmat=torch.from_numpy(viewmat).float(),
         K=torch.from_numpy(view.K).float(),
@@ -196,7 +196,7 @@ def _load_view(view: View, viewmat: NDArray[np.float64], *, hide: bool) -> Loade
         height=view.height,
     )
     size = view.width, view.height
-    # A copy, since the array of PIL's memory is read-only.
+    # A copy, since PIL's memory is read-only.
     pixels = np.array(images.read_png_pil(view.file, size))
     mask = None if view.mask is None else images.read_mask(view.mask, size)
     if hide:

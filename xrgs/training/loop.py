@@ -39,10 +39,10 @@ if TYPE_CHECKING:
     from xrgs.training.components import Component, Step, TrainingView
     from xrgs.training.dataset import Dataset
 
-    #: Scores of Gaussians by name; None where one is not available.
+    #: Function: Gaussians -> name of a score -> its value, None if not available.
     Evaluate = Callable[[Gaussians], Mapping[str, float | None]]
 
-#: The strategies of densification, by the names in `xrgs.splat.settings.STRATEGIES`.
+#: Name in `xrgs.splat.settings.STRATEGIES` -> strategy of densification.
 STRATEGIES: Mapping[str, type[Strategy]] = {"default": DefaultStrategy, "mcmc": MCMCStrategy}
 
 
@@ -56,29 +56,29 @@ def train(
     """Train one configuration. The same data, config and seed give the same bits on the CPU.
 
     Args:
-        data: The views to train on and the points to start from.
-        conf: The config. `components.count_matched`, which asks for several trainings, is not
-            read: `xrgs.training.count_matching.train_cell` does that.
-        checkpoint: Where the state of the run is written. Training continues from a state that
-            `Checkpoint.load` has read. None writes nothing.
-        extra_components: Components that run after the ones that the config switches on.
-        evaluate: Scores the Gaussians after every `train.evaluate_every` steps but the last, as
-            they would be saved. Its time does not count as training time.
+        data: The training views and the SfM points.
+        conf: The config. `components.count_matched`, which needs several trainings, is ignored:
+            use `xrgs.training.count_matching.train_cell` for it.
+        checkpoint: Saves the state of the run. Training continues from the state that
+            `Checkpoint.load` has read, if any. None saves nothing.
+        extra_components: Components that run after those of the config.
+        evaluate: Scores the Gaussians, as they would be saved, every `train.evaluate_every` steps
+            except after the last. Its time does not count as training time.
 
     Returns:
         The trained Gaussians, on the CPU, and the record of the training.
 
     Raises:
-        CheckpointError: The state that was read does not fit this config and data.
+        CheckpointError: The checkpoint does not fit this config and data.
         XrgsError: A component's value is out of range, a view is too small for a component, the
-            components leave no view to train on, or the backend can't be used on this machine.
+            components exclude every view, or the backend can't be used on this machine.
     """
     checkpoint = checkpoint or Checkpoint()
     run = _set_up(data, conf, extra_components)
     run.components.before_training(run.renderer)
     run.components.on_gaussians_changed(run.optimizer.gaussians)
-    # Everything that a step changes. The optimizer comes first: it restores the Gaussians, whose
-    # number the other states must fit.
+    # All objects that a step changes. The optimizer is first: it restores the Gaussians, and the
+    # other states must fit their number.
     checkpoint.register(
         optimizer=run.optimizer,
         strategy=run.strategy,
@@ -95,7 +95,7 @@ def train(
 
 
 class _Views:
-    """The training views as components want them at present, and their targets for the loss."""
+    """The training views as the components changed them, and their targets for the loss."""
 
     def __init__(self, views: Iterable[TrainingView], backend: str) -> None:
         self.backend = backend
@@ -106,27 +106,27 @@ class _Views:
         self.change_to(self.own)
 
     def change_to(self, views: Mapping[str, TrainingView]) -> None:
-        """Use other views, with the moments of their photographs."""
+        """Replace the views, and compute the SSIM statistics of the new photographs."""
         if views is not self.present:
             self.present = views
             self.moments = OnDemand(self._moments, views.values())
 
     def target(self, view: TrainingView) -> Target:
-        """Return the target of a present view; its photograph is a new tensor where 8 bits are."""
-        # First, so that no two targets exist at once.
+        """Return the target of a view; an 8-bit photograph is converted to a new float tensor."""
+        # Freed first, so that there is only one target in memory.
         self.drawn = None
         self.drawn = Target(view.image, *self.moments[view.name])
         return self.drawn
 
     def _moments(self, view: TrainingView) -> tuple[Tensor, Tensor]:
-        """The moments of a view's photograph that the loss needs (`Target`)."""
+        """Return mean and variance of a view's photograph in each SSIM window (`Target`)."""
         target = prepare_target(view.image, backend=self.backend)
         return target.mean, target.variance
 
 
 @dataclass(frozen=True)
 class _Run:
-    """Everything that the steps of one run use."""
+    """The objects of one run."""
 
     splat: SplatConf
     steps: int
@@ -143,13 +143,13 @@ class _Run:
     memory: TrainingMemory
 
     def evaluates_after(self, step: int) -> bool:
-        """Whether the Gaussians are evaluated after a step."""
-        # Not after the last: the caller scores the trained Gaussians.
+        """Return whether the Gaussians are evaluated after a step."""
+        # Not after the last step, since the caller scores the trained Gaussians.
         done, every = step + 1, self.evaluate_every
         return bool(every) and done % every == 0 and done < self.steps
 
     def score(self, evaluate: Evaluate) -> Callable[[], Mapping[str, float | None]]:
-        """Return a closure that bakes a copy of the Gaussians and scores it."""
+        """Return a function that bakes a copy of the Gaussians and scores it."""
         gaussians = self.optimizer.gaussians
 
         def scores() -> Mapping[str, float | None]:
@@ -169,7 +169,7 @@ class _Forward:
     sh_degree: int
     """Highest band of the spherical harmonics that was rendered."""
     means2d_offset: Tensor
-    """[N, 2] zeros; its gradient is the image-plane gradient that densification reads."""
+    """[N, 2] zeros, whose gradient is the image-plane gradient for densification."""
     render: Render
     loss: Tensor
     """Scalar."""
@@ -220,7 +220,7 @@ def _forward(run: _Run, step: Step) -> _Forward:
 
 
 def _update(run: _Run, step: Step, forward: _Forward) -> None:
-    """Backward, the components' changes of the gradients, then the optimizer's step."""
+    """Run the backward pass, the components' changes of gradients, and the optimizer's step."""
     run.optimizer.zero_grad()
     torch.autograd.backward(forward.loss)
     run.components.after_backward(run.optimizer.gaussians, step)
@@ -232,12 +232,12 @@ def _update(run: _Run, step: Step, forward: _Forward) -> None:
 
 
 def _densify(run: _Run, step: Step, forward: _Forward) -> Refinement:
-    """Densify, prune and reset; return the counts of what was done."""
+    """Densify, prune and reset; return the counts."""
     # None without a backward pass, or if the render shows no Gaussian.
     grad2d, camera = forward.means2d_offset.grad, forward.camera
     visible = forward.render.visible
     if grad2d is not None:
-        if step.view.mask is not None:  # a view shows only what is inside its mask
+        if step.view.mask is not None:  # masked pixels show no Gaussian
             visible = visible & (grad2d != 0).any(dim=1)
         grad2d = run.components.densification_grad2d(grad2d, step)
     refinement = run.strategy.after_step(
@@ -255,7 +255,7 @@ def _densify(run: _Run, step: Step, forward: _Forward) -> Refinement:
 
 
 def _prune_by_components(run: _Run, step: Step, refinement: Refinement) -> Refinement:
-    """Remove the Gaussians that components choose; return the step's counts with theirs."""
+    """Remove the Gaussians that components choose, and add their number to the step's counts."""
     gaussians = run.optimizer.gaussians
     mask = run.components.to_prune(gaussians, step)
     if mask is None or not mask.any():
@@ -266,7 +266,7 @@ def _prune_by_components(run: _Run, step: Step, refinement: Refinement) -> Refin
 
 
 def _first_gaussians(data: Dataset, conf: Conf, backend: str) -> tuple[Gaussians, float]:
-    """Return the Gaussians that training starts from, and the seconds that a dense start took."""
+    """Create the first Gaussians; return them and the time of a dense start, seconds."""
     splat = conf.splat
     sparse = from_points(
         data.points,
@@ -278,7 +278,7 @@ def _first_gaussians(data: Dataset, conf: Conf, backend: str) -> tuple[Gaussians
     )
     if splat.init == "sfm":
         return sparse, 0.0
-    from xrgs.training.dense import dense_start  # counts in a cell's identity where it is on
+    from xrgs.training.dense import dense_start  # in a cell's identity only if on
 
     began = time.perf_counter()
     gaussians = dense_start(data, sparse, backend, seeded_generator(conf.seed, "dense"))
@@ -286,13 +286,13 @@ def _first_gaussians(data: Dataset, conf: Conf, backend: str) -> tuple[Gaussians
 
 
 def _set_up(data: Dataset, conf: Conf, extra_components: Iterable[Component]) -> _Run:
-    """Build everything that the steps use."""
+    """Build the objects of a run."""
     splat, steps = conf.splat, conf.train.steps
     backend = resolve_backend(splat.backend)
     gaussians, start_seconds = _first_gaussians(data, conf, backend)
     place = device(backend)
     gaussians = gaussians.to(place)
-    # The points stay on the CPU: what is computed of them is computed once.
+    # The points stay on the CPU, since they are used only once.
     data = replace(data, train=tuple(view.to(place) for view in data.train))
     optimizer = SplatOptimizer(
         gaussians, splat.optimizer, scene_scale=data.scene_scale, steps=steps, backend=backend
@@ -309,7 +309,7 @@ def _set_up(data: Dataset, conf: Conf, extra_components: Iterable[Component]) ->
         view_pixels=data.view_pixels,
     )
     views = _Views(data.train, backend)
-    # After all preparation, since its clock starts here.
+    # Last, since its clock starts here.
     recorder = TrainingRecorder(steps, splat.densify.grow_grad2d, data.train)
     if start_seconds:
         recorder.add_start(start_seconds)

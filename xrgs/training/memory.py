@@ -1,4 +1,4 @@
-"""The memory of training: bounds what is kept of the photographs, and counts what is held."""
+"""The memory of training: limits the cache of SSIM statistics, and measures the peak."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ _CODE = (type, ModuleType, FunctionType)
 
 
 class OnDemand(Mapping[str, T]):
-    """Tensors of training views by the views' names, made anew where they are not kept.
+    """View name -> a tensor or an object with tensors, cached as far as memory allows.
 
-    The values of the first views are kept, as far as `KEPT_BYTES` go. Which views are first does
-    not matter, since they are drawn in random order.
+    The values of the first views are cached, up to `KEPT_BYTES`; the others are made at each
+    access. The order of the views does not matter, since training draws them at random.
 
     Attributes:
-        make: What makes a value; `TrainingMemory` counts its tensors too.
-        kept: The values that are kept.
+        make: Makes a value. `TrainingMemory` also counts tensors that this function holds.
+        kept: View name -> cached value.
     """
 
     def __init__(self, make: Callable[[TrainingView], T], views: Iterable[TrainingView]) -> None:
-        """Make the values that are kept.
+        """Make the cached values.
 
         Args:
-            make: Returns the value of a view: a tensor, or an object that has some.
+            make: Returns the value of a view: a tensor or an object with tensors.
             views: The views, with unique names.
         """
         self.make = make
@@ -64,17 +64,23 @@ class OnDemand(Mapping[str, T]):
 
 
 class TrainingMemory:
-    """The largest number of bytes that a step of training held.
+    """Measures the peak memory of a training step, bytes.
 
-    A step holds the model, its gradients and the optimizer's state, the statistics of
-    densification, the photographs (8 bits), the moments that are kept of them and the target of the
-    step's view for the loss, the tensors of the components, what autograd saves between forward and
-    backward, and the buffers of the renderer. All count as if they existed at once; tensors that
-    share their memory count once. What forward and backward allocate and free in between does not
-    count. On a GPU the count is the most that torch has allocated there, all of this included.
+    A step's memory is the sum of
 
-    Steps with the same number of Gaussians and harmonics, on views of one size and class whose
-    moments are all kept or all not, hold the same. Only the first of them is counted.
+    - the model, its gradients and the optimizer's state,
+    - the statistics of densification,
+    - the 8-bit photographs, their cached SSIM statistics, and the target of the step's view,
+    - the tensors of the components,
+    - the tensors that autograd saves from the forward to the backward pass,
+    - the buffers of the renderer.
+
+    Tensors that share their memory count once. Temporary tensors within the forward and the
+    backward pass do not count. On a GPU the count is torch's peak of allocated memory there.
+
+    Steps of the same kind use the same memory: the same number of Gaussians and harmonics, and a
+    view of the same size and tag, with cached statistics or without. Only the first step of each
+    kind is measured.
 
     Attributes:
         largest_bytes: The largest count so far.
@@ -85,7 +91,7 @@ class TrainingMemory:
 
         Args:
             holders: Objects that hold tensors throughout training, in their attributes or items.
-            device: Where training has its tensors: `cpu` or `cuda`.
+            device: Device of the training tensors, `cpu` or `cuda`.
         """
         self.holders = holders
         self.device = device
@@ -94,44 +100,44 @@ class TrainingMemory:
         self.largest_bytes = 0
         self._counted: set[str] = set()
         self._noted: tuple[str, int] | None = None
-        """The kind of a step whose forward pass was noted, and the bytes that autograd saved."""
+        """Kind of the measured step, and the size of the tensors that autograd saved, bytes."""
 
     @contextmanager
     def of_forward(
         self, step: Step, gaussians: int, sh_degree: int, *, kept: bool = True
     ) -> Iterator[None]:
-        """Note what autograd saves in the forward pass of a step that has not been counted.
+        """Measure the tensors that autograd saves in the forward pass, once for each kind of step.
 
         Args:
             step: The step.
             gaussians: The number of Gaussians.
             sh_degree: Highest band of the spherical harmonics that is rendered.
-            kept: Whether the moments of the view's photograph are kept.
+            kept: Whether the SSIM statistics of the view's photograph are cached.
         """
         camera, logged = step.view.camera, sorted(step.log.items())
         size = f"{camera.width} x {camera.height} px"
         kind = f"{gaussians} {sh_degree} {step.view.tag} {size} {kept} {logged}"
         self._noted = None
-        # On a GPU without hooks: with them, gsplat 1.5.3 loses the gradients of its `absgrad`.
+        # No hooks on a GPU: with hooks, gsplat 1.5.3 loses the gradients of its `absgrad`.
         if kind in self._counted or self.device == "cuda":
             yield
             return
         packed: list[weakref.ref[Tensor]] = []
 
         def note(tensor: Tensor) -> Tensor:
-            kept = tensor.detach()  # the tensor itself would make a cycle of references
+            kept = tensor.detach()  # returning the tensor itself would create a reference cycle
             packed.append(weakref.ref(kept))
             return kept
 
         with torch.autograd.graph.saved_tensors_hooks(note, lambda tensor: tensor):
             yield
-        # Only what still exists, and now: other tensors will have the addresses of dropped ones.
+        # Read now, and only of living tensors: later tensors may reuse the addresses of freed ones.
         saved = _storages(tensor for noted in packed if (tensor := noted()) is not None)
         held = _storages(tensors_in(self.holders))
         self._noted = kind, sum(size for address, size in saved.items() if address not in held)
 
     def state_dict(self) -> State:
-        """Return the largest count so far, and the kinds of steps that have been counted."""
+        """Return the peak so far, and the measured kinds of steps."""
         return {"largest_bytes": self.largest_bytes, "counted": sorted(self._counted)}
 
     def load_state_dict(self, state: State) -> None:
@@ -140,9 +146,10 @@ class TrainingMemory:
         self._counted = set(state["counted"])
 
     def record(self, render: Render) -> None:
-        """Count the step of a render, if its forward pass was noted, while its gradients exist.
+        """Add up the memory of a step whose forward pass was measured.
 
-        A step without a backward pass is not counted: another of its kind holds more.
+        Call it while the step's gradients exist. Steps without a backward pass need no call: others
+        of their kind use more memory.
         """
         if self.device == "cuda":
             self.largest_bytes = max(self.largest_bytes, torch.cuda.max_memory_allocated())
@@ -168,7 +175,7 @@ def tensors_in(value: object) -> Iterator[Tensor]:
             if inner.is_leaf and inner.grad is not None:
                 yield inner.grad
         elif isinstance(inner, Mapping):
-            # Other values of `OnDemand` do not exist; to go through its items would make them.
+            # Iterating over the items of `OnDemand` would make the values that are not cached.
             waiting += [inner.kept, inner.make] if isinstance(inner, OnDemand) else inner.values()
         elif isinstance(inner, (list, tuple, set, frozenset)):
             waiting += inner
@@ -177,6 +184,6 @@ def tensors_in(value: object) -> Iterator[Tensor]:
 
 
 def _storages(tensors: Iterable[Tensor]) -> dict[int, int]:
-    """Return the bytes of the memory of tensors by its address."""
+    """Return memory address -> size in bytes, of the tensors' storages."""
     found = (tensor.untyped_storage() for tensor in tensors)
     return {storage.data_ptr(): storage.nbytes() for storage in found}

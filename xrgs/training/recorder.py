@@ -1,4 +1,4 @@
-"""The record of a training run: its history, time, memory and amount of work."""
+"""The record of a training run: history, time, memory and amount of work."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from xrgs.training.components import Step, TrainingView
 
 _HISTORY_ROWS = 200
-"""A history has about as many rows, whatever the number of steps."""
+"""Approximate number of rows in a history, for any number of steps."""
 
 
 @dataclass(frozen=True)
@@ -33,30 +33,33 @@ class TrainingResult:
     gaussians: Gaussians
     """The trained model."""
     history: list[dict[str, Any]]
-    """One row for each recorded step. `step`, `view`, `loss` and `gaussians` (their number before
-    the step's densification) belong to the step itself. `steps_HR`, `steps_LR`, the counts of
-    `Refinement`, `skipped_backward` (steps without a backward pass) and `skipped_shN` (steps that
-    did not move shN) are totals since the start of training; the last two are columns only where
-    there are such steps. Every other column is a component's log (`Step.log`): its mean over the
-    steps since the row before that logged it, or None where none did. Every row has every
-    column."""
+    """One row for each recorded step; every row has every column.
+
+    - Of the step itself: `step`, `view`, `loss`, `gaussians` (the number before densification).
+    - Totals since the start: `steps_HR`, `steps_LR`, the counts of `Refinement`, and if not 0,
+      `skipped_backward` (steps without a backward pass) and `skipped_shN` (steps without an update
+      of shN).
+    - All other columns are from the components (`Step.log`): the mean over the steps since the
+      previous row with a value, or None without a value.
+    """
     seconds: float
-    """Time of the training steps and of a dense start: no loading of data, no evaluation, no
+    """Time of the training steps and of a dense start, without loading data, evaluation and
     checkpoints."""
     memory_bytes: int
-    """Bytes that training held at the step where they were most (`TrainingMemory`)."""
+    """Peak memory of a training step, bytes (`TrainingMemory`)."""
     evaluations: int
-    """Alpha evaluations of all forward passes: the amount of work, independent of the machine."""
+    """Number of alpha evaluations of all forward passes: the work, independent of the machine."""
     work: dict[str, int]
     """Further counts of work: `StepWork.totals`."""
     stage_seconds: dict[str, float]
-    """`seconds` by the stages of a step: `forward` (render and loss), `backward`, `optimizer`, and
-    `densification` with all that follows; `start` before them where training has a dense start."""
+    """Stage -> its part of `seconds`: `start` if there is a dense start, `forward` (render and
+    loss), `backward`, `optimizer`, and `densification` with the rest of the step."""
     grow_grad2d: float
     """`splat.densify.grow_grad2d` of this training, in normalised device units."""
     scores: list[dict[str, Any]] = field(default_factory=list)
-    """One row for each evaluation during training: `step` (the number of steps done), `seconds` and
-    `evaluations` (of alpha, both since the start), `gaussians`, and the scores by their names."""
+    """One row for each evaluation during training: `step` (number of finished steps), `seconds` and
+    `evaluations` (of alpha) since the start, `gaussians` (their number), and a column for each
+    score."""
 
 
 class TrainingRecorder:
@@ -86,7 +89,7 @@ class TrainingRecorder:
         self.stage_seconds: defaultdict[str, float] = defaultdict(float)
 
     def lap(self, stage: str) -> None:
-        """Add the time since the last lap, or since the start, to a stage of the steps.
+        """Add the time since the last lap, or since the start, to a stage.
 
         Args:
             stage: A key of `TrainingResult.stage_seconds`.
@@ -97,16 +100,15 @@ class TrainingRecorder:
         self.lap_started = now
 
     def add_start(self, seconds: float) -> None:
-        """Count what has passed before the clock was started as training time, as stage `start`."""
+        """Add time before the clock was started to the training time, as stage `start`."""
         self.started -= seconds
         self.stage_seconds["start"] += seconds
 
     def record_skipped(self, part: str) -> None:
-        """Count a part of a step that is left out; call it before `record_step`.
+        """Count a skipped part of a step; call it before `record_step`.
 
         Args:
-            part: `backward` (with the update), or `shN`. The history has the total as
-                `skipped_<part>`.
+            part: `backward` (with the update) or `shN`; the history's column is `skipped_<part>`.
         """
         self.counts[f"skipped_{part}"] += 1
 
@@ -116,7 +118,7 @@ class TrainingRecorder:
         """Record a step after its update and before its densification.
 
         Args:
-            step: The step, with what the components logged of it.
+            step: The step, with the values that the components logged.
             loss: Scalar, the loss of the step.
             render: The step's render.
             gaussians: The Gaussians that were rendered.
@@ -134,23 +136,23 @@ class TrainingRecorder:
             self.logged.clear()
 
     def record_evaluations(self, evaluations: int) -> None:
-        """Count the alpha evaluations of a render beside the steps' own renders."""
+        """Count the alpha evaluations of a render other than that of a step."""
         self.evaluations += evaluations
 
     def record_refinement(self, refinement: Refinement) -> None:
-        """Add a step's refinement to the counts of the history; the step ends here."""
+        """Add a step's refinement to the counts of the history, at the end of the step."""
         self.counts.update(refinement.counts())
         self.lap("densification")
 
     def record_scores(
         self, steps: int, gaussians: int, evaluate: Callable[[], Mapping[str, float | None]]
     ) -> None:
-        """Evaluate the Gaussians, and exclude the time from the training time.
+        """Evaluate the Gaussians; the time does not count as training time.
 
         Args:
-            steps: Number of steps done.
+            steps: Number of finished steps.
             gaussians: Number of Gaussians.
-            evaluate: Returns the scores by name.
+            evaluate: Returns name -> score.
         """
         start = time.perf_counter()
         row = {
@@ -163,12 +165,12 @@ class TrainingRecorder:
         self.exclude_time(time.perf_counter() - start)
 
     def exclude_time(self, seconds: float) -> None:
-        """Exclude the seconds that have just passed from the training time."""
+        """Subtract seconds that have just passed from the training time."""
         self.started += seconds
         self.lap_started += seconds
 
     def state_dict(self) -> State:
-        """Return everything recorded so far, and the seconds of training so far."""
+        """Return the record and the training time so far."""
         return {
             "seconds": time.perf_counter() - self.started,
             "counts": dict(self.counts),
@@ -181,7 +183,7 @@ class TrainingRecorder:
         }
 
     def load_state_dict(self, state: State) -> None:
-        """Continue a run of as many steps; the time since `state_dict` is excluded."""
+        """Continue a run of the same length; the time since `state_dict` does not count."""
         self.lap_started = time.perf_counter()
         self.started = self.lap_started - float(state["seconds"])
         self.counts = Counter(state["counts"])
@@ -193,7 +195,7 @@ class TrainingRecorder:
         self.stage_seconds = defaultdict(float, state["stage_seconds"])
 
     def finish(self, gaussians: Gaussians, memory_bytes: int) -> TrainingResult:
-        """Stop the clock and return the result; each row of its history has every column."""
+        """Stop the clock and return the result; fill missing columns of the history with None."""
         seconds = time.perf_counter() - self.started
         empty = {name: None for row in self.history for name in row} | dict.fromkeys(self.counts, 0)
         return TrainingResult(

@@ -1,4 +1,4 @@
-"""Renders training views as a step of training does."""
+"""Renders training views as a training step does, with all components."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ if TYPE_CHECKING:
 
 
 def inside_mask(image: Tensor, photograph: Tensor, mask: Tensor | None) -> Tensor:
-    """Return a render with the pixels of the photograph outside the mask.
+    """Replace the pixels of a render outside the mask by those of the photograph.
 
-    There is no loss then, and no gradient. A window of SSIM across the border of the mask compares
-    equal pixels there, so that the loss stays a mean over all pixels, and the gradients of the used
-    pixels are as without a mask.
+    So they have no loss and no gradient. SSIM windows across the border of the mask compare equal
+    pixels outside it. The loss remains a mean over all pixels, and used pixels have the same
+    gradients as without a mask.
 
     Args:
         image: The render, [H, W, 3].
         photograph: [H, W, 3].
-        mask: [H, W] bool, True for a pixel that is used; None uses all.
+        mask: [H, W] bool, True for a used pixel; None uses all.
     """
     return image if mask is None else image.where(mask[..., None], photograph)
 
@@ -39,7 +39,7 @@ class StepRenderer:
     """Renders any training view as a step on that view does, with all components.
 
     Components get it before the first step (`Component.before_training`). The alpha evaluations of
-    `photograph` and `attribute` count as the run's.
+    `photograph` and `attribute` are added to those of the run.
     """
 
     components: Components
@@ -47,7 +47,7 @@ class StepRenderer:
     raster: RasterSettings
     """How Gaussians become pixels."""
     sh_every: int
-    """Steps of this run after which one more band of the harmonics is on."""
+    """Steps of this run between the activations of two bands of the spherical harmonics."""
     backend: str
     """`torch` or `native`."""
     recorder: TrainingRecorder
@@ -69,7 +69,7 @@ class StepRenderer:
             means2d_offset: [N, 2] as for `rasterize_parameters`.
 
         Returns:
-            The render at the camera's size. Its evaluations have not been counted yet.
+            The render at the camera's size. Its alpha evaluations are not yet counted.
         """
         raw = not self.components.override("before_render")
         return rasterize_parameters(
@@ -83,15 +83,15 @@ class StepRenderer:
         )
 
     def _activated(self, gaussians: Gaussians, step: Step) -> ActivatedGaussians:
-        """The activated Gaussians as the components change them for the step's render."""
+        """Return the activated Gaussians after the components' `before_render`."""
         return self.components.before_render(gaussians.activated(backend=self.backend), step)
 
     @torch.no_grad()
     def photograph(self, gaussians: Gaussians, step: Step) -> Tensor:
-        """Render the step's view as it is compared with its photograph, inside the mask.
+        """Render the step's view as for the loss; outside the mask it is the photograph.
 
         Returns:
-            [H, W, 3] at the photograph's size, not clamped to 0..1, without a graph.
+            [H, W, 3] at the photograph's size, not clamped to 0..1, detached from autograd.
         """
         camera = self.components.render_camera(step.view.camera, step)
         render = self.render(gaussians, step, camera)
@@ -102,10 +102,10 @@ class StepRenderer:
 
     @torch.no_grad()
     def attribute(self, pixels: Tensor, gaussians: Gaussians, step: Step) -> Tensor:
-        """Sum a map of the view's photograph, weighted by each Gaussian's part in it.
+        """Sum a map over the view's photograph for each Gaussian, by its blending weights.
 
-        As `attribute_pixels`, but `to_photograph` is applied to the weights of a Gaussian. Since
-        that is linear, its transpose brings the map to the render's size.
+        As `attribute_pixels`, with blending weights at the photograph's size. `to_photograph` is
+        linear, so the transpose of it is applied to the map instead.
 
         Args:
             pixels: [H, W] the map, at the photograph's size.

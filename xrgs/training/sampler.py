@@ -20,29 +20,29 @@ if TYPE_CHECKING:
 
 
 GOLDEN = (math.sqrt(5) - 1) / 2
-"""The golden ratio less 1. Its multiples, modulo 1, fill 0..1 evenly."""
+"""The golden ratio minus 1. Its multiples modulo 1 fill 0..1 evenly."""
 
 
 class EpochSampler:
     """Samples training views epoch by epoch, one view a step.
 
-    An epoch is a random permutation of the views that `allows_view` allows when the epoch begins. A
-    view that is no longer allowed at its turn is skipped. A view that becomes allowed during an
-    epoch takes part from the next epoch on.
+    An epoch is a random permutation of the views that `allows_view` allows at its beginning. A view
+    that is no longer allowed at its turn is skipped. A view that becomes allowed during an epoch
+    takes part from the next epoch on.
 
-    If fewer than `hr_share` of the views are HR, HR and LR views have epochs of their own, and step
+    If the fraction of HR views is below `hr_share`, HR and LR views have separate epochs, and step
     t draws an HR view if
 
         (offset + t GOLDEN) mod 1 < hr_share,
 
-    where the seed decides the offset in 0..1. The number of HR views in n steps in a row differs
-    from `hr_share` n by less than 5 in a run of 30,000 steps. If no view of a class is allowed, the
-    other class has its draws.
+    with an offset in 0..1 from the seed. In a run of 30,000 steps, the number of HR views in any n
+    consecutive steps differs from `hr_share` n by less than 5. If no view of one tag is allowed,
+    views of the other are drawn instead.
 
-    Our choice: 3D Gaussian Splatting [kerbl2023] draws every view once an epoch. The golden ratio
-    decides, since it spreads the HR views evenly over every k-th step as well: refinements and
-    `splat.optimizer.shN_every` act at every k-th step, and would meet a single class where HR and
-    LR views alternate.
+    Our choice: 3D Gaussian Splatting [kerbl2023] draws every view once in an epoch. The golden
+    ratio also spreads the HR views evenly over every k-th step. This matters for refinements and
+    `splat.optimizer.shN_every`, which act at every k-th step: if HR and LR views alternated, all
+    these steps could have the same tag.
     """
 
     def __init__(
@@ -57,24 +57,24 @@ class EpochSampler:
 
         Args:
             views: The training views; their names are unique.
-            seed: `seed` of the config; the order of the views depends on it alone.
+            seed: `seed` of the config, which determines the order of the views.
             steps: Number of steps of the whole run.
-            allows_view: Whether a step may train on its view.
-            hr_share: Least share of the steps that draw an HR view.
+            allows_view: Returns whether a step may train on its view.
+            hr_share: Least fraction of the steps that draw an HR view, 0..1.
         """
         self.views = views
         self.steps = steps
         self.allows_view = allows_view
         self.hr_share = hr_share
         self.next_step = 0
-        """The number of the next step, from 0."""
+        """Number of the next step, from 0."""
         self.generator = seeded_generator(seed, "views")
         offset = torch.rand((), generator=seeded_generator(seed, "classes"), dtype=torch.float64)
         self.offset = offset.item()
         high, low = ([view for view in views if view.tag == tag] for tag in ("HR", "LR"))
         apart = len(high) < hr_share * len(views)
         self.classes = [_Class(members) for members in ([high, low] if apart else [views])]
-        """The views that have epochs of their own: HR and LR views, or all views together."""
+        """Groups of views with separate epochs: HR and LR views, or one group of all views."""
 
     def __iter__(self) -> Iterator[Step]:
         return self
@@ -100,7 +100,7 @@ class EpochSampler:
         return Step(self.next_step - 1, self.steps, view)
 
     def _draw(self, members: _Class) -> LoadedView | None:
-        """The next view of a class; None where none of its views is allowed."""
+        """Return the next view of a group; None if none of its views is allowed."""
         while members.remaining and not self._allows(members.remaining[-1]):
             members.remaining.pop()
         if not members.remaining:
@@ -125,7 +125,7 @@ class EpochSampler:
 
         Raises:
             KeyError: An entry is missing, or names an unknown view.
-            ValueError: The epochs are those of another `hr_share`.
+            ValueError: The state is of a run with another `hr_share`.
         """
         by_name = {view.name: view for view in self.views}
         self.next_step = int(state["next_step"])
@@ -136,8 +136,8 @@ class EpochSampler:
 
 @dataclass
 class _Class:
-    """Views that have epochs of their own."""
+    """Views with a separate epoch."""
 
     views: Sequence[LoadedView]
     remaining: list[LoadedView] = field(default_factory=list)
-    """The views left in the present epoch, in reverse order: the next one is the last."""
+    """Remaining views of the present epoch, in reverse order: the next view is the last."""

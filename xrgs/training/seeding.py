@@ -15,7 +15,7 @@ def seeded_generator(seed: int, purpose: str) -> torch.Generator:
 
     Args:
         seed: `seed` of the config.
-        purpose: `init`, `views`, `densify`, or a component's own.
+        purpose: `init`, `views`, `densify`, or a component's name for its purpose.
 
     Returns:
         A generator on the CPU, in the same state for the same arguments.

@@ -1,4 +1,4 @@
-"""Counts the work of training steps, and the work that they skipped."""
+"""Counts the work of training steps, and the skipped work."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ if TYPE_CHECKING:
 
 
 class StepWork:
-    """Sums of the work that steps did and skipped.
+    """Totals of the work that steps did and skipped.
 
-    Everything but the number of visible Gaussians is known without further work.
+    All counts except the number of visible Gaussians are available without extra computation.
 
     Attributes:
-        photographs: Pixels of each view's photograph, by its name.
-        counts: The totals of the steps.
+        photographs: View name -> number of pixels of its photograph.
+        counts: Name -> total over the steps.
         views: Names of the views that were trained on.
     """
 
@@ -67,17 +67,19 @@ class StepWork:
         """Return the totals over all steps.
 
         Returns:
-            `views`: the number of views that were trained on. Sums over the steps: `gaussians` and
-            `gaussians_visible`; `pixels` that were rendered, `pixels_photograph` of the steps'
-            photographs, and `pixels_left_out`, by which renders were smaller than these; `pairs` of
-            a pixel and a Gaussian, `pairs_visible` of a pixel and a visible Gaussian, and
-            `pairs_in_tiles` (`Render.tile_evaluations`); `sh_coefficients` that visible Gaussians
-            have, and `sh_coefficients_left_out` of bands that were not on.
+            - `views`: number of views that were trained on; all other counts are sums over steps;
+            - `gaussians`, `gaussians_visible`;
+            - `pixels` of the renders, `pixels_photograph` of the photographs, and
+              `pixels_left_out`, the pixels that smaller renders saved;
+            - `pairs` of a pixel and a Gaussian, `pairs_visible` of a pixel and a visible Gaussian,
+              `pairs_in_tiles` (`Render.tile_evaluations`);
+            - `sh_coefficients` of visible Gaussians, and `sh_coefficients_left_out` of bands that
+              were not on.
         """
         return {"views": len(self.views)} | dict(self.counts)
 
     def state_dict(self) -> State:
-        """Return everything counted so far."""
+        """Return the totals so far."""
         return {"counts": dict(self.counts), "views": sorted(self.views)}
 
     def load_state_dict(self, state: State) -> None:

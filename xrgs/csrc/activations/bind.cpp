@@ -1,4 +1,4 @@
-// xrgs._native.exp and logistic, which activate raw parameters, and their gradients.
+// xrgs._native.exp and logistic, the activation functions of raw parameters, and their gradients.
 #include "activations/bind.h"
 
 #include <nanobind/nanobind.h>
@@ -19,7 +19,7 @@ using Vector = nb::ndarray<const float, nb::ndim<1>, nb::c_contig, nb::device::c
 
 constexpr std::int64_t kValuesPerTask = 32768;
 
-// Calls body(first, last) for the ranges that 0..count-1 is divided into.
+// Divides 0..count-1 into ranges, and calls body(first, last) for each of them.
 template <class Body>
 void parallel_ranges(int threads, std::int64_t count, Body&& body) {
   nb::gil_scoped_release release;

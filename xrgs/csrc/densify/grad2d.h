@@ -9,7 +9,7 @@
 namespace xrgs {
 
 struct Grad2dJob {
-  const float* means2d_grad;    // [N, 2] gradient of the loss by the projected means, per px
+  const float* means2d_grad;    // [N, 2] dL/d(projected means), per px
   const std::uint8_t* visible;  // [N] 0 or 1
   float scale_x, scale_y;       // convert the gradient to the units of the sum
   float* grad2d_sum;            // [N] sum of the norms of the scaled gradients, updated in place

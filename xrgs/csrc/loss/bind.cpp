@@ -1,5 +1,5 @@
 // xrgs._native.photometric_loss: L1 and SSIM of an image against a target, and the gradient of the
-// loss. xrgs._native.window_moments: what it needs of the target.
+// loss. xrgs._native.window_moments: mean and variance of the target, for photometric_loss.
 #include "loss/bind.h"
 
 #include <nanobind/nanobind.h>
@@ -26,8 +26,8 @@ using Window = nb::ndarray<const double, nb::shape<kWindow>, nb::c_contig, nb::d
 using PixelWeights = nb::ndarray<const float, nb::shape<-1, -1>, nb::c_contig, nb::device::cpu>;
 
 constexpr double kSigma = 1.5;    // of the window, px
-constexpr int kMinBandRows = 32;  // a band computes ten rows more than its own
-constexpr int kMomentRows = 32;   // of a task; those of the image that it reads stay in the cache
+constexpr int kMinBandRows = 32;  // a band also computes ten rows of its neighbours
+constexpr int kMomentRows = 32;   // of a task, so that its rows of the image stay in the cache
 
 // Sets the weights of a normalised Gaussian window.
 void set_window(float* window) {
@@ -41,9 +41,8 @@ void set_window(float* window) {
 
 void run_bands(const PhotometricJob& job, int threads) {
   const PhotometricKernels& kernels = XRGS_SELECT(photometric_kernels);
-  // A single band repeats the least work. With more threads each has two bands, so that one which
-  // another
-  // program delays holds up less.
+  // Each band repeats work at its border, so a single thread gets one band. With more threads each
+  // gets two bands, so that a thread that another program delays holds up less work.
   const int most = job.height / kMinBandRows > 0 ? job.height / kMinBandRows : 1;
   const int bands = threads <= 1 ? 1 : (2 * threads < most ? 2 * threads : most);
   const std::size_t size = (kernels.scratch_size(job) + 15) / 16 * 16;

@@ -11,10 +11,10 @@ constexpr int kWindow = 11;  // side of the SSIM window, px
 constexpr int kMapShrink =
     kWindow - 1;  // rows and columns by which the SSIM map is smaller than the image
 
-// The arguments of one evaluation. The gradient is that of l1_slope * sum w |image - target| +
-// ssim_slope * sum w (1 - S), where w is the weight of each pixel, and S is the SSIM of each
-// channel at every place where the whole window lies inside the image; its weight is that of the
-// pixel at the middle of the window.
+// The arguments of one evaluation. The gradient is that of
+//   l1_slope * sum w |image - target| + ssim_slope * sum w (1 - S),
+// where w is the weight of each pixel, and S is the SSIM of each channel in every window that lies
+// inside the image. The weight of a window is that of its central pixel.
 struct PhotometricJob {
   const float *image, *target;                 // [H, W, 3]
   const float *target_mean, *target_variance;  // [H - 10, W - 10, 3], under the window
@@ -29,10 +29,10 @@ struct PhotometricJob {
 };
 
 struct PhotometricKernels {
-  // Returns the floats of scratch that one call of `band` needs, on a 64-byte boundary.
+  // Returns the number of floats in the `scratch` of `band`, which must be 64-byte aligned.
   std::size_t (*scratch_size)(const PhotometricJob& job);
-  // Computes the sums and the gradient of rows first..last-1 of the image. A row has the same
-  // result whatever band it belongs to.
+  // Computes the sums and the gradient of rows first..last-1 of the image. The result of a row does
+  // not depend on its band.
   void (*band)(const PhotometricJob& job, int first, int last, float* scratch);
 };
 

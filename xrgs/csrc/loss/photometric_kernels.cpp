@@ -1,10 +1,10 @@
-// The kernel reads the rows of an image as they are stored, with interleaved channels: a tap of the
-// window is one row further down, or three floats further right.
+// The kernel reads the rows of an image with interleaved channels: the next tap of the window is
+// one row below, or three floats to the right.
 //
-// SSIM compares an image x with its target t under a window, whose weighted mean is E. Near
-// convergence x and t are almost equal, and the usual form, 1 - SSIM with moments of x, loses all
-// of its digits. Hence the moments are those of the difference d = x - t, and 1 - SSIM is a sum of
-// small terms, none of which is a difference of large ones:
+// SSIM compares an image x with its target t in a window, whose weighted mean is E. Near
+// convergence x and t are almost equal, and the usual form of 1 - SSIM, with moments of x, loses
+// all digits. So the moments of the difference d = x - t are used, and 1 - SSIM is a sum of small
+// terms, without differences of large numbers:
 //   p = E[d], q = E[d^2], r = E[t d];
 //   var_d = max(0, q - p^2),             cov = r - mean_t p, the covariance of t and d,
 //   mean_x = mean_t + p,                 var_x = max(0, var_t + 2 cov + var_d),
@@ -12,21 +12,21 @@
 //   N = 2 mean_x mean_t + C1,            l = luminance = N / M,
 //   M = mean_x^2 + mean_t^2 + C1 = p^2 + N,
 //   1 - SSIM = 1 - (1 - a) l = a l + p^2 / M.
-// D is the usual denominator, since var_t + cov is the covariance of t and x. Rounding makes the
-// variances of flat images negative, which the two maxima mend. Of the derivatives by q, r and p,
-// the kernel keeps these factors:
+// D is the usual denominator, since var_t + cov is the covariance of t and x. Rounding can make the
+// variances of flat images negative, hence the two maxima. The derivatives with respect to q, r and
+// p are stored as these factors:
 //   u = 2 (1 - a) l / D  = 2 by_q,
 //   v = 2 a l / D        = -by_r,
 //   by_p = 2 (1 - a) p (mean_t^2 + mean_t mean_x + C1) / M^2 - p u + mean_t v.
 // The fraction is the derivative of p^2 / M, 2 p / M - 2 p^2 mean_x / M^2, without its
-// cancellation: M - p mean_x = mean_t^2 + mean_t mean_x + C1. A variance that a maximum replaces
-// has no derivative: u is zero for var_d, and for var_x v is zero and u is 2 l / D.
+// cancellation: M - p mean_x = mean_t^2 + mean_t mean_x + C1. A variance that a maximum clamps has
+// no derivative: if var_d is clamped, u is zero; if var_x is, v is zero and u is 2 l / D.
 //
-// For each group of kGroup rows, the moments are summed down the image first, for a chunk of
-// columns at a time, and then across while the chunk is in the first-level cache. by_p, u and v go
-// to a ring of rows. The gradient is the same window over them, transposed, taken from that ring:
+// For each group of kGroup rows, the moments are first summed down the image, for a chunk of
+// columns at a time, and then across, while the chunk is in the first-level cache. by_p, u and v
+// are stored in a ring of rows. The gradient is the transposed window applied to the ring:
 //   dL/dx = ssim_slope (window(by_p) + d window(u) - t window(v)) + l1_slope sign(d).
-// With pixel weights, by_p, u and v are multiplied by the weight of the window's middle, and
+// With pixel weights, by_p, u and v are multiplied by the weight of the window's central pixel, and
 // l1_slope by that of the pixel.
 #include <cstring>
 
@@ -37,7 +37,7 @@ namespace xrgs {
 namespace XRGS_NS {
 namespace {
 
-// Rows that are summed together and share their loads: 12 sums with AVX-512, else 6.
+// Rows that are summed together to share loads: 12 sums with AVX-512, else 6.
 constexpr int kGroup = kVectorRegisters >= 32 ? 4 : 2;
 constexpr int kInputRows = kGroup + kMapShrink;  // rows that the windows of a group cover
 constexpr int kRing = 16;                        // rows of the derivatives that are kept
@@ -50,8 +50,8 @@ constexpr int kPrefetchDistance = 256;         // floats
 constexpr int kFields = 3;                     // moments, or derivatives by them
 constexpr float kC1 = 0.0001f, kC2 = 0.0009f;  // (0.01)^2 and (0.03)^2, for a data range of 1
 
-// The window along one axis, in all lanes. Loops use a local one: a store through a pointer could
-// change any other as far as the compiler knows, which would load the weights again after each.
+// The window's weights along one axis, in all lanes. Loops use a local copy: for one in memory, the
+// compiler would have to reload the weights after every store through a pointer.
 struct WindowWeights {
   Floats of[kWindow / 2 + 1];
   explicit WindowWeights(const float* window) {
@@ -62,7 +62,7 @@ struct WindowWeights {
   }
 };
 
-// The sums of a chunk, after the last kMargin columns of the chunk to its left.
+// The sums of a chunk, preceded by the last kMargin columns of the chunk to its left.
 struct ColumnChunk {
   alignas(64) float rows[kGroup][kFields][kMargin + kChunk];
 
@@ -76,13 +76,13 @@ struct ColumnChunk {
 
 int round_up(int floats) { return (floats + kLanes - 1) / kLanes * kLanes; }
 
-// The floats of a row of the ring: an odd number of cache lines, so that rows do not share cache
-// sets.
+// Number of floats in a row of the ring: an odd number of cache lines, so that rows do not share
+// cache sets.
 std::size_t ring_row_size(int width) {
   return static_cast<std::size_t>((round_up(kChannels * width) / kLanes | 1) * kLanes);
 }
 
-// The floats of a row of pixel weights, one for each channel.
+// Number of floats in a row of pixel weights, which are repeated for each channel.
 int weight_row_size(int width) { return kChannels * round_up(width); }
 
 XRGS_INLINE Floats load_lanes(const float* p, int lanes) {
@@ -126,8 +126,7 @@ XRGS_INLINE Floats sum_across(const WindowWeights& w, const float* p) {
   return sum;
 }
 
-// The sums of the rows of a group, vector by vector: of a chunk's width in float, and of these in
-// double.
+// The sums of the rows of a group: in float over the width of a chunk, and over chunks in double.
 struct RowSums {
   Floats part[kGroup];
   double total[kGroup] = {};
@@ -138,7 +137,7 @@ struct RowSums {
     for (Floats& sum : part) sum = broadcast(0.0f);
     vectors = 0;
   }
-  // Ends the vector that was added to the rows' parts.
+  // Call after adding a vector to `part`. At the end of a chunk's width, `part` goes to `total`.
   XRGS_INLINE void next(bool last) {
     if (++vectors < kChunk / kLanes && !last) return;
     for (int row = 0; row < kGroup; ++row) total[row] += static_cast<double>(sum_lanes(part[row]));
@@ -164,7 +163,8 @@ class Band {
   }
 
   void compute() {
-    // The gradient of the first rows needs the map's rows above, whose windows cover them.
+    // The gradient of the first rows also needs the rows of the map above, whose windows cover
+    // them.
     const int start =
         job_.gradient == nullptr || first_ < kMapShrink ? first_ : first_ - kMapShrink;
     for (int y = start; y < last_; y += kGroup) {
@@ -178,9 +178,10 @@ class Band {
 
  private:
   // Calls down(column, lanes, chunk_index) for each vector of a group's `inputs` columns, and
-  // across(column, lanes, chunk_index) for each of its `outputs` as soon as the sums that it reads
-  // are in the chunk. Its taps start at `chunk_index`, which is `lead` columns to the left of its
-  // own column. Both are inlined twice, so that nearly all calls, those of kLanes, need no masks.
+  // across(column, lanes, chunk_index) for each vector of its `outputs` columns, as soon as the
+  // chunk has the sums for it. The taps of an output start at `chunk_index`, `lead` columns to the
+  // left of its column. Both are inlined twice, so that calls with kLanes lanes, nearly all of
+  // them, need no masks.
   template <class Down, class Across>
   XRGS_INLINE void for_each_column(int inputs, int outputs, int lead, Down&& down,
                                    Across&& across) {
@@ -225,7 +226,7 @@ class Band {
       if (is_own_row(y + row)) totals[y + row] = sums.total[row];
   }
 
-  // Sums the absolute differences of a group's rows, in the order in which gradient_group does.
+  // Sums the absolute differences of a group's rows, in the same order as gradient_group.
   void absolute_group(int y) {
     if (kWeighted) expand_weights(y, weight_rows_);
     RowSums sums;
@@ -368,7 +369,7 @@ class Band {
 
   // The pixel weights of a group's row, once for each channel.
   float* pixel_weights(int row) const { return weight_rows_ + row * weight_row_size(job_.width); }
-  // The pixel weights at the middles of the windows of a group's row, likewise.
+  // The pixel weights at the centres of the windows of a group's row, once for each channel.
   float* centre_weights(int row) const { return pixel_weights(kGroup + row) + kRowShrink / 2; }
   float* ring(int y, int field) { return ring_ + (field * kRing + (y & (kRing - 1))) * row_size_; }
 

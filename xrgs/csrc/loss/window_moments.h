@@ -1,5 +1,5 @@
-// Mean and variance of a photograph under the SSIM window, which the photometric loss compares with
-// those of a render. The results have the bits of xrgs.splat.torch.loss.target_moments.
+// Mean and variance of a photograph in each SSIM window, for the photometric loss. The results have
+// the bits of xrgs.splat.torch.loss.target_moments.
 #pragma once
 
 #include "isa.h"

@@ -1,7 +1,6 @@
-// A variance is a small difference of squares, so all sums are in double. Their terms are added one
-// by one, in the order of the taps, and no product is fused with a sum: every instruction set has
-// the same bits. The loops over adjacent floats are left to the compiler, which has vectors of
-// doubles for them.
+// A variance is a small difference of squares, so all sums are in double. Terms are added one by
+// one, in the order of the taps, without fused multiply-add, so every instruction set gives the
+// same bits. The compiler vectorises the loops over adjacent floats.
 #include <cstddef>
 
 #include "loss/window_moments.h"
@@ -33,7 +32,7 @@ XRGS_INLINE void sum_down(const float* __restrict in, std::size_t row_size, cons
   }
 }
 
-// Sums these across the image, and stores `count` adjacent moments.
+// Sums the results of sum_down across the image, and stores `count` adjacent moments.
 XRGS_INLINE void sum_across(const double* __restrict means, const double* __restrict squares,
                             const double* weights, int count, float* __restrict mean,
                             float* __restrict variance) {

@@ -20,8 +20,8 @@ struct AdamGroup {
 };
 
 // The parameter shN. Its gradient is the gradient of sh0 times the basis functions in the viewing
-// direction, divided by that of degree 0 (Eq. 31 of docs/rasterizer.md); it is computed during the
-// step, so that it is never written to memory.
+// direction, divided by the basis function of degree 0 (Eq. 31 of docs/rasterizer.md). It is
+// computed during the step and never written to memory.
 struct ShNAdamGroup {
   AdamGroup adam;             // gradient is unused; size is count * rest_count * 3
   std::int64_t count;         // Gaussians

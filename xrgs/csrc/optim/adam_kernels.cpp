@@ -25,8 +25,8 @@ XRGS_INLINE void update(const Constants& k, float* p, const float* g, float* m, 
   const Floats gradient = whole ? load(g) : load_first(g, lanes);
   Floats exp_avg = whole ? load(m) : load_first(m, lanes);
   Floats exp_avg_sq = whole ? load(v) : load_first(v, lanes);
-  // Where the gradient and both moments are zero nothing changes, so nothing is written:
-  // coefficients of degrees that are not used yet, and Gaussians that no view has shown.
+  // If gradient and both moments are zero, nothing changes and nothing is written: for coefficients
+  // of degrees that are not used yet, and for Gaussians that no view has shown.
   const Floats zero = broadcast(0.0f);
   if (to_bits((gradient == zero) & (exp_avg == zero) & (exp_avg_sq == zero)) == 0xffffu) return;
   exp_avg = fma(gradient - exp_avg, k.one_minus_beta1, exp_avg);
@@ -54,8 +54,8 @@ void step(const AdamGroup& group, std::int64_t first, std::int64_t last) {
   if (i < last) update_at(i, static_cast<int>(last - i));
 }
 
-// The gradient of a row is made while the values of rows before it are updated, so that its
-// permutations fill the gaps that divisions and roots leave.
+// The gradient of a row is computed while previous rows are updated, so that its permutations run
+// during the latency of their divisions and roots.
 template <int Degree>
 void step_shN_degree(const ShNAdamGroup& group, std::int64_t first, std::int64_t last) {
   const AdamGroup& adam = group.adam;

@@ -45,8 +45,8 @@ struct AdamOptions {
   }
 };
 
-// A tensor of a tuple. Nothing is converted, because the step would change the copy. Throws
-// TypeError.
+// Returns a tensor of a tuple, without conversion, because the step would update the converted
+// copy. Throws TypeError.
 template <class Array>
 Array tensor_of(const nb::tuple& fields, std::size_t index, const char* name) {
   Array values;
@@ -139,7 +139,7 @@ void adam_step(nb::list tuples, double beta1, double beta2, double eps, int thre
   if (harmonics) shN = harmonics_from_tuple(*harmonics, options);
   nb::gil_scoped_release release;
   const AdamKernels& kernels = XRGS_SELECT(adam_kernels);
-  // Before the means move: the gradient of shN needs those that were rendered.
+  // shN first, before the means move: its gradient needs the means that were rendered.
   const std::int64_t tasks = (shN.count + kGaussiansPerTask - 1) / kGaussiansPerTask;
   parallel_for(threads, tasks, [&](std::int64_t i) {
     const std::int64_t first = i * kGaussiansPerTask;

@@ -1,5 +1,4 @@
-// The Python bindings of the rasterizer: they check shapes, and release the GIL while the kernels
-// run.
+// The Python bindings of the rasterizer, which check shapes and release the GIL for the kernels.
 #include "raster/bind.h"
 
 #include <nanobind/ndarray.h>
@@ -42,7 +41,7 @@ using Image = Array<Side<-1>, Side<-1>, Side<3>>;
 using Plane = Array<Side<-1>, Side<-1>>;
 using Matrix4 = std::array<float, 16>;
 
-// The frame behind a Python object. It is released for other views when Python drops the object.
+// The frame of a Python object. It is released for reuse when Python deletes the object.
 class FrameHandle {
  public:
   FrameHandle() : frame_(acquire_frame()) {}
@@ -84,7 +83,7 @@ struct ParameterTensors {
   ShCoefficients sh0, shN;
   std::optional<Offsets> means2d_offset;
 
-  // Throws ValueError where shapes do not fit one another or the degree of the harmonics.
+  // Throws ValueError if shapes do not match each other or the degree of the harmonics.
   GaussianParameters checked(int sh_degree) const {
     const std::size_t count = means.shape(0);
     check_rows("quats", quats.shape(0), count);
@@ -114,7 +113,7 @@ bool all_finite(const float* p, std::size_t count) {
   return true;
 }
 
-// Finds the parameter that made a render fail, and throws an error that names it.
+// Throws an error that names the parameter that made a render fail.
 [[noreturn]] void throw_invalid_parameter(const ParameterTensors& t, bool raw,
                                           std::uint32_t faults) {
   const auto check = [](const char* name, const auto& array) {
@@ -156,7 +155,7 @@ bool all_finite(const float* p, std::size_t count) {
   throw nb::python_error();
 }
 
-// The frame of a render that was completed. Throws ValueError where there is none.
+// Returns the frame of a completed render. Throws ValueError if there is none.
 Frame& rendered(FrameHandle& frame) {
   if (!frame->rendered)
     throw nb::value_error("the frame has no render: call forward first, and without an error");
@@ -261,8 +260,8 @@ void set_camera_position(RenderConfig& config) {
   }
 }
 
-// Throws an error that names the first number of the camera or the settings that float32 does not
-// hold, or the background that is too bright.
+// Throws an error that names the first number of the camera or the settings that overflows float32,
+// or the background if it is too bright.
 void check_finite(const RenderConfig& config) {
   constexpr float kLargest = std::numeric_limits<float>::max();
   for (float value : config.rotation) check_within("viewmat", value, kLargest);
@@ -302,7 +301,7 @@ RenderConfig make_config(const Matrix4& viewmat, const std::array<float, 4>& int
   config.near = near;
   config.eps2d = eps2d;
   config.alpha_min = std::max(alpha_min, std::numeric_limits<float>::min());
-  // In double, whose rounding to float hides how mathematical libraries differ.
+  // In double, then rounded to float, so that differences between mathematical libraries vanish.
   config.log2_alpha_min = static_cast<float>(std::log2(static_cast<double>(config.alpha_min)));
   config.alpha_max = alpha_max;
   config.transmittance_min = transmittance_min;
@@ -315,7 +314,7 @@ RenderConfig make_config(const Matrix4& viewmat, const std::array<float, 4>& int
   return config;
 }
 
-// The eight bits of a byte as eight bytes of 0 or 1, the lowest bit in the lowest byte.
+// Expands the eight bits of a byte to eight bytes of 0 or 1, the lowest bit to the lowest byte.
 std::uint64_t spread_bits(std::uint64_t byte) {
   const std::uint64_t one_bit_each = byte * 0x0101010101010101u & 0x8040201008040201u;
   return (one_bit_each + 0x7f7f7f7f7f7f7f7fu) >> 7 & 0x0101010101010101u;
@@ -358,7 +357,7 @@ void bind_raster(nb::module_& m) {
            "culling: out_of_view, sub_threshold, tiles, blocks, saturated, as in\n"
            "xrgs.splat.settings.CullingOptions. raw: scales are natural logarithms and opacities\n"
            "logits, and so are their gradients. The others are those of RasterSettings.");
-  // Tensors are never converted: a copy of another type would cost more than the render.
+  // Tensors are not converted: copying to another type would take longer than the render.
   nb::class_<FrameHandle>(m, "Frame",
                           "The memory of one rendered view, from its forward to its backward pass.")
       .def(nb::init<>())

@@ -1,13 +1,13 @@
 // Compositing, forward: blends a tile's list of Gaussians front to back into sixteen blocks of 4x4
 // pixels.
 //
-// Alpha is capped at alpha_max and skipped below alpha_min (Eq. 8). A pixel's colour gains alpha T
-// color, and its transmittance T becomes T (1 - alpha) (Eq. 14). Where that is transmittance_min or
-// less, this Gaussian is not composited and the pixel is saturated. T is still multiplied after
-// that: it can only fall, so the test keeps failing, and the composited Gaussians are a prefix of
-// the list.
+// Alpha is capped at alpha_max and skipped below alpha_min (Eq. 8). alpha T color is added to the
+// colour of a pixel, and its transmittance T becomes T (1 - alpha) (Eq. 14). If the new
+// transmittance is transmittance_min or less, the Gaussian is not composited and the pixel is
+// saturated. T is still multiplied after that: it never rises, so later Gaussians are not
+// composited either, and the composited ones are a prefix of the list.
 //
-// With the culling options off, every block goes through the whole list of its tile.
+// With the culling options off, every block processes the whole list of its tile.
 #include "raster/cutoff_ellipse.h"
 #include "raster/stages.h"
 #include "raster/tile_batch.h"
@@ -22,7 +22,7 @@ static_assert(kCheckEvery % kUnroll == 0, "a block is tested after whole groups 
 // The pixels of a block while it is composited.
 struct BlockState {
   alignas(64) float running_T[16];  // the product of 1 - alpha of all Gaussians so far
-  alignas(64) float final_T[16];    // the same of the composited ones: the transmittance
+  alignas(64) float final_T[16];    // that of the composited Gaussians: the transmittance
   alignas(64) float red[16], green[16], blue[16];
 };
 
@@ -41,7 +41,7 @@ struct BitPositions {
 };
 constexpr BitPositions kBitPositions;
 
-// Writes the positions of the set bits among the first `count`, and returns how many they are.
+// Writes the positions of the set bits among the first `count`, and returns their number.
 XRGS_INLINE int list_set_bits(const std::uint16_t* bits, int count, std::uint8_t* list) {
   int n = 0;
   for (int i = 0; i < count; i += 8) {
@@ -55,7 +55,7 @@ XRGS_INLINE int list_set_bits(const std::uint16_t* bits, int count, std::uint8_t
   return n;
 }
 
-// Fills a list of `count` up to a multiple of kUnroll.
+// Pads a list of `count` entries to a multiple of kUnroll with the transparent row.
 XRGS_INLINE void fill_up(std::uint8_t* list, int count) {
   for (int i = count; i % kUnroll != 0; ++i) list[i] = kBatchSize;
 }
@@ -91,7 +91,7 @@ void load_and_cull_batch(const Frame& frame, const Tile& tile, const TileEntry* 
   }
 }
 
-// Marks every Gaussian of the batch as one that overlaps every block.
+// Marks every Gaussian of the batch as overlapping every block.
 void hit_all_blocks(int count, BlockHits& hits) {
   for (int at = 0; at < count; at += 16) {
     const int lanes = count - at < 16 ? count - at : 16;
@@ -154,7 +154,7 @@ std::uint32_t init_blocks(const Tile& tile, const RenderConfig& config, BlockSta
   return active_blocks;
 }
 
-// Prefetches a row of pixels that write_blocks will write, where the image has it.
+// Prefetches a row of pixels for write_blocks, if it is inside the image.
 XRGS_INLINE void prefetch_image_row(const Tile& tile, const RenderConfig& config, int row,
                                     const float* image, const float* alpha) {
   const std::int64_t first = row_start(tile, config, row);
@@ -167,8 +167,8 @@ XRGS_INLINE void prefetch_image_row(const Tile& tile, const RenderConfig& config
 void write_blocks(const Tile& tile, const RenderConfig& config, const BlockState* blocks,
                   float* image, float* alpha) {
   const float* background = config.background;
-  // All blocks are stored before any is copied: a load from bytes that two stores have just written
-  // waits until both are in the cache.
+  // Store all blocks before copying any: loading bytes that two stores have just written would wait
+  // until both are in the cache.
   alignas(64) float colors[kBlocksPerTile][48], alphas[kBlocksPerTile][16];
   for (int b = 0; b < kBlocksPerTile; ++b) {
     const Floats final_T = load(blocks[b].final_T);

@@ -5,17 +5,19 @@
 // the pixel's list has (Eq. 16 and 17)
 //   G_i = (color_i - background) . v_image + v_alpha,    w_i = alpha_i T_i,
 //   dL/d(ln alpha_i) = w_i (G_i - R_i),    R_{i-1} = R_i + alpha_i (G_i - R_i),
-// where R_i is what lies behind Gaussian i, divided by the transmittance in front of it. Computed
-// back to front, R needs no division by 1 - alpha and loses no digits to cancellation.
+// where R_i is the sum of w_j G_j over all Gaussians j behind Gaussian i, divided by the
+// transmittance behind i. Computed back to front, R needs no division by 1 - alpha, and no digits
+// are lost to cancellation.
 //
 // The batches of a tile are processed from the last to the first. For each block, a pass front to
-// back repeats the forward pass from the transmittance that it saved, and stores alpha and w; a
-// pass back to front then computes R and sums over the block's pixels. The sums are products of 4x4
-// matrices: with g as a matrix, X = (1, x, x^2) in each column and Y = (1, y, y^2) in each row,
-// both from the tile's centre, Y^T g X holds the nine moments; with w in the place of g, the sums
-// of w v_image. At the end of the batch the moments are moved from the tile's centre to each
-// Gaussian's mean (Eq. 18). Absolute values have no such moments, so with absgrad the derivatives
-// by the mean are summed pixel by pixel (Eq. 21).
+// back repeats the forward pass, from the transmittance that the forward pass saved, and stores
+// alpha and w. A pass back to front then computes R and sums over the block's pixels. The sums are
+// products of 4x4 matrices: with g = dL/d(ln alpha) as a matrix, X = (1, x, x^2) in each column and
+// Y = (1, y, y^2) in each row, both relative to the tile's centre, Y^T g X has the nine moments.
+// The sums of w v_image are computed in the same way. At the end of the batch the moments are moved
+// from the tile's centre to each Gaussian's mean (Eq. 18). This is not possible for absolute
+// values, so with absgrad the derivatives with respect to the mean are summed pixel by pixel (Eq.
+// 21).
 #include "raster/stages.h"
 #include "raster/tile_batch.h"
 
@@ -51,7 +53,7 @@ XRGS_INLINE void store_by_column(Floats red, Floats green, Floats blue, float (&
 void load_pixel_gradients(const Tile& tile, const RenderConfig& config, const float* v_image,
                           const float* v_alpha, PixelGradients* pixel_gradients) {
   const float* background = config.background;
-  // All blocks are copied before any is loaded, for the reason given at write_blocks.
+  // Copy all blocks before loading any, for the reason given in write_blocks.
   alignas(64) float colors[kBlocksPerTile][48] = {}, alphas[kBlocksPerTile][16] = {};
   for (int b = 0; b < kBlocksPerTile; ++b) {
     const BlockRegion region(tile, config, b);
@@ -74,7 +76,7 @@ void load_pixel_gradients(const Tile& tile, const RenderConfig& config, const fl
   }
 }
 
-// Prefetches one row of pixels of what load_pixel_gradients reads, where the tile and row exist.
+// Prefetches a row of pixels for load_pixel_gradients, if the tile and row exist.
 XRGS_INLINE void prefetch_gradient_row(const Frame& frame, int tile_index, int row,
                                        const float* v_image, const float* v_alpha) {
   if (tile_index >= frame.config.tile_count()) return;
@@ -84,8 +86,7 @@ XRGS_INLINE void prefetch_gradient_row(const Frame& frame, int tile_index, int r
   prefetch(v_alpha + first);
 }
 
-// Repeats the forward pass over a block's list: stores alpha (zero where it was not composited) and
-// w.
+// Repeats the forward pass for a block's list: stores alpha (zero if not composited) and w.
 XRGS_INLINE void recompute_alphas(const BatchRows& rows, const std::uint8_t* list, int count,
                                   int block, const AlphaThresholds& thresholds,
                                   const float* transmittance, AlphasAndWeights& out) {
@@ -104,8 +105,8 @@ XRGS_INLINE void recompute_alphas(const BatchRows& rows, const std::uint8_t* lis
   }
 }
 
-// The factors of the moments, for each row and column i of a tile. of_column[i] has 1, x, x^2, 0 in
-// every row; of_row[i] has 1, y, y^2, 0, each in the whole of a row of its own.
+// The factors of the moments, for each row and column i of a tile, as 4x4 matrices: of_column[i]
+// has the columns 1, x, x^2, 0, and of_row[i] the rows 1, y, y^2, 0.
 struct PixelPowers {
   alignas(64) float of_column[kTileSize][16], of_row[kTileSize][16];
   constexpr PixelPowers() : of_column(), of_row() {
@@ -132,14 +133,14 @@ XRGS_INLINE Floats times_columns(Floats a, const Floats (&factors)[4]) {
   return fma(broadcast_column<3>(a), factors[3], fma(broadcast_column<1>(a), factors[1], even));
 }
 
-// The places of a moment row that hold the sums of absolute values: its last column has no moments.
+// Indices of the sums of absolute values in a moment row, in its last column, which has no moments.
 constexpr int kAbsU = 3, kAbsV = 7;
 
-// Processes a block's list back to front and adds each Gaussian's sums over the block's pixels to
-// its row of moments. Row i < 3, column j < 3 of that row, read as a 4x4 matrix, has the sum of g
-// y^i x^j. Those of w v_image go to its row of color_sums, pixel row by pixel row. With Absgrad the
-// last column of rows 0 and 1 has those of |g u| and |g (chol_yy v - chol_xy u)|. `behind` is R of
-// Eq. 17, for each pixel.
+// Processes a block's list back to front, and adds each Gaussian's sums over the block's pixels to
+// its row of moments. As a 4x4 matrix, this row has the sum of g y^i x^j in row i < 3, column j <
+// 3; with Absgrad, the last column of rows 0 and 1 has the sums of |g u| and |g (chol_yy v -
+// chol_xy u)|. The sums of w v_image are added to its row of color_sums, pixel row by pixel row.
+// `behind` is R of Eq. 17, for each pixel.
 template <bool Absgrad>
 XRGS_INLINE void accumulate_moments(const BatchRows& rows, const std::uint8_t* list, int count,
                                     int block, const AlphaThresholds& thresholds,
@@ -166,7 +167,7 @@ XRGS_INLINE void accumulate_moments(const BatchRows& rows, const std::uint8_t* l
               fma(broadcast(g[i][kGreen]), green, fma(broadcast(g[i][kBlue]), blue, constant)));
       const Floats difference = color_gradient - r;
       r = fma(alpha, difference, r);
-      // An alpha that is capped at alpha_max does not change with its Gaussian.
+      // An alpha capped at alpha_max has no gradient.
       gradient[i] = multiply_where(alpha < thresholds.alpha_max, weight[i], difference);
     }
     Floats by_row[kUnroll], even[kUnroll], odd[kUnroll], color[kUnroll];
@@ -195,9 +196,9 @@ XRGS_INLINE void accumulate_moments(const BatchRows& rows, const std::uint8_t* l
   store(behind, r);
 }
 
-// The first six columns of pair_grads, from the moments m about the tile's centre, for sixteen
-// Gaussians. u is a linear function of the position, so its moments are combinations of those of x
-// and y; it is small where g is not, at the centre of the tile as well, so that little cancels.
+// Computes the first six columns of pair_grads from the moments m about the tile's centre, for
+// sixteen Gaussians. u is a linear function of the position, so its moments are linear combinations
+// of those of x and y. Where g is large u is small, also at the tile's centre, so little cancels.
 XRGS_INLINE void move_moments(const Floats (&fields)[16], const Floats (&m)[16],
                               Floats (&out)[16]) {
   const Floats mean_y = fields[kY], chol_xx = fields[kCholXX], chol_xy = fields[kCholXY];
@@ -209,7 +210,7 @@ XRGS_INLINE void move_moments(const Floats (&fields)[16], const Floats (&m)[16],
   const Floats g_u = times_u(g, gx, gy);
   const Floats g_ux = times_u(gx, gxx, gxy), g_uy = times_u(gy, gxy, gyy);
   const Floats g_dy = fnma(mean_y, g, gy);
-  // chol_* is scaled for base 2: its u is that of Eq. 8 times sqrt(log2(e)).
+  // chol_* is scaled for base 2: u here is u of Eq. 8 times sqrt(log2(e)).
   const Floats to_base_e = broadcast(0.832554611f);
   out[kGrad] = g;
   out[kGradU] = to_base_e * g_u;
@@ -259,8 +260,7 @@ void load_batch(const Frame& frame, const Tile& tile, const TileEntry* entries, 
   }
 }
 
-// The first entry of the last batch of a tile that was composited; past all entries where there is
-// no such tile.
+// The first entry of a tile's last composited batch; past all entries if there is no such tile.
 std::size_t last_batch(const Frame& frame, int tile) {
   if (tile >= frame.config.tile_count()) return frame.entries.size();
   const auto index = static_cast<std::size_t>(tile);
@@ -286,8 +286,7 @@ void backward_tile(const Frame& frame, int tile_index, const float* v_image, con
   const std::uint32_t batches = (tile.end - tile.begin + kBatchSize - 1) / kBatchSize;
   const std::uint32_t composited = frame.composited_batches[tile.index];
   const TileEntry* entries = frame.entries.data() + tile.begin;
-  // Batches that the forward pass never started, because every pixel was saturated, have no
-  // gradient.
+  // Batches that the forward pass skipped, because every pixel was saturated, have no gradient.
   for (std::uint32_t n = composited * kBatchSize; composited < batches && n < tile.end - tile.begin;
        ++n)
     stream(pair_grads + std::size_t{entries[n].pair} * kPairGradStride, broadcast(0.0f));
@@ -298,7 +297,7 @@ void backward_tile(const Frame& frame, int tile_index, const float* v_image, con
     const SavedBatch& batch = frame.batches[frame.batch_offsets[tile.index] + n];
     load_batch(frame, tile, entries + at, count, rows, moments, color_sums);
     for (int b = 0; b < kBlocksPerTile; ++b) {
-      // The next batch to be processed is the one in front of this, or the last of the next tile.
+      // The next batch is the one in front of this batch, or the last batch of the next tile.
       prefetch_part(frame, n > 0 ? tile.begin + at - kBatchSize : next_tile, b);
       if (n == 0) prefetch_gradient_row(frame, tile_index + 1, b, v_image, v_alpha);
       if (b + kBlocksAhead < kBlocksPerTile) {

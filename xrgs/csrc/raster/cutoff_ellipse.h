@@ -1,11 +1,11 @@
 // The horizontal extent of a Gaussian's cutoff ellipse within a strip of pixel rows.
 //
-// Outside the cutoff ellipse, u^2 + v^2 <= cutoff_radius_sq, alpha is below alpha_min (Eq. 11). At
-// a given dy the ellipse covers dx = (chol_xy dy +- sqrt(cutoff_radius_sq - v^2)) / chol_xx (Eq.
-// 13). It is convex, so within a strip of rows its rightmost point is that of the whole ellipse (at
-// dy = dy_at_xmax) or the point of the strip that is nearest to it; the leftmost likewise, with
-// -dy_at_xmax. The part within the strip is convex too, so it overlaps every column of pixels
-// between the two.
+// Outside the cutoff ellipse u^2 + v^2 <= cutoff_radius_sq, alpha is below alpha_min (Eq. 11). At
+// height dy the ellipse extends between dx = (chol_xy dy +- sqrt(cutoff_radius_sq - v^2)) / chol_xx
+// (Eq. 13). It is convex, so its rightmost point within a strip of rows is at dy = dy_at_xmax, as
+// that of the whole ellipse, or at the row of the strip nearest to it. The leftmost point is found
+// in the same way at -dy_at_xmax. The part within the strip is convex too, so it overlaps every
+// column of pixels between the two points.
 #pragma once
 
 #include "raster/types.h"
@@ -19,8 +19,8 @@ struct CutoffEllipse {
   Floats x, y, chol_xy, chol_yy, inv_chol_xx, dy_at_xmax, radius_sq, radius_y;
 };
 
-// Finds the extent left..right of the ellipse over the rows whose pixel centres are top..bottom.
-// The mask leaves out the lanes whose ellipse does not overlap these rows.
+// Computes the extent left..right of the ellipse within the rows with pixel centres top..bottom.
+// Returns the lanes whose ellipse overlaps these rows.
 XRGS_INLINE Mask strip_extent(const CutoffEllipse& e, Floats top, Floats bottom, Floats& left,
                               Floats& right) {
   const Floats low = top - e.y, high = bottom - e.y;
@@ -34,8 +34,7 @@ XRGS_INLINE Mask strip_extent(const CutoffEllipse& e, Floats top, Floats bottom,
   return (low <= e.radius_y) & (-e.radius_y <= high);
 }
 
-// The ellipses of sixteen projected Gaussians that were transposed: fields[i] is the i-th field of
-// each.
+// The ellipses of sixteen projected Gaussians, transposed: fields[i] has the i-th field of each.
 XRGS_INLINE CutoffEllipse cutoff_ellipse(const Floats (&fields)[16]) {
   return {fields[0], fields[1],  fields[3],  fields[4],
           fields[9], fields[10], fields[11], fields[12]};

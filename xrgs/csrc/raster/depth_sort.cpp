@@ -1,9 +1,9 @@
-// A radix sort from the least significant digit on, by digits of up to 11 bits, of as many bits as
-// the keys differ in.
+// A radix sort, least significant digit first, with digits of up to 11 bits that cover the range of
+// the keys.
 //
-// Each chunk of items counts its own digits. The counts are summed digit by digit and, within a
-// digit, chunk by chunk, which gives each chunk the positions of its items. The result is that of a
-// stable sort, whatever the number of chunks.
+// Each chunk of items counts its digits. The counts are summed digit by digit and, within a digit,
+// chunk by chunk, which gives each chunk the positions of its items. The sort is stable for any
+// number of chunks.
 #include "raster/depth_sort.h"
 
 #include <algorithm>
@@ -16,7 +16,7 @@ namespace {
 
 constexpr int kMaxDigitBits = 11;
 constexpr std::size_t kMaxDigitValues = std::size_t{1} << kMaxDigitBits;
-constexpr std::int64_t kMinChunk = 8192;  // for fewer items it does not pay to wake a thread
+constexpr std::int64_t kMinChunk = 8192;  // for fewer items, waking a thread does not pay
 
 std::uint32_t key_of(std::uint64_t item) { return static_cast<std::uint32_t>(item >> 32); }
 
@@ -24,7 +24,7 @@ struct KeyRange {
   std::uint32_t min, max;
 };
 
-// The range of the keys of items first..last-1, of which there must be at least one.
+// The range of the keys of items first..last-1, at least one item.
 KeyRange key_range(const std::uint64_t* items, std::int64_t first, std::int64_t last) {
   KeyRange range{key_of(items[first]), key_of(items[first])};
   for (std::int64_t i = first + 1; i < last; ++i) {
@@ -34,7 +34,7 @@ KeyRange key_range(const std::uint64_t* items, std::int64_t first, std::int64_t 
   return range;
 }
 
-// Bits of a digit: the smallest number with which as few digits as possible cover the range.
+// Bits of a digit: the least number that covers the range with the least number of digits.
 int digit_bits(std::uint32_t range) {
   int bits = 1;
   while (bits < 32 && range >> bits != 0) ++bits;
@@ -42,7 +42,7 @@ int digit_bits(std::uint32_t range) {
   return (bits + digits - 1) / digits;
 }
 
-// Turns counts [chunks, digit_values] into the first position of each chunk's items of each digit.
+// Converts counts [chunks, digit_values] to the first position of each chunk's items of each digit.
 void counts_to_positions(std::uint32_t* counts, std::int64_t chunks, std::size_t digit_values) {
   std::uint32_t position = 0;
   for (std::size_t digit = 0; digit < digit_values; ++digit)

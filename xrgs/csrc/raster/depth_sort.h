@@ -5,8 +5,8 @@
 
 namespace xrgs {
 
-// Sorts frame.order[0..frame.visible_count-1] by the depth key in its upper 32 bits. The sort is
-// stable: Gaussians of equal depth stay in the order of their indices.
+// Sorts frame.order[0..frame.visible_count-1] by the depth key in the upper 32 bits. The sort is
+// stable: Gaussians of equal depth keep the order of their indices.
 void sort_by_depth(int threads, Frame& frame, Workspace& workspace);
 
 }  // namespace xrgs

@@ -11,7 +11,7 @@ namespace {
 
 constexpr std::size_t kMaxUnused = 2;  // training renders one view at a time, or a pair
 
-// Objects that are not in use and wait to be used again.
+// Unused objects for reuse.
 template <class T>
 class FreeList {
  public:

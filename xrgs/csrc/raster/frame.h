@@ -1,7 +1,7 @@
 // The memory of one rendered view, from its forward pass to its backward pass.
 //
-// Frames are used again for later views, because touching new pages takes as long as the kernels
-// that write them.
+// Frames are reused for later views, because touching new pages takes as long as the kernels that
+// write them.
 #pragma once
 
 #include <cstddef>
@@ -18,7 +18,7 @@ namespace xrgs {
 void* new_block(std::size_t bytes);
 void free_block(void* block) noexcept;
 
-// An array on a 64-byte boundary whose memory only grows and is never initialised.
+// A 64-byte aligned array whose memory only grows, and is not initialised.
 template <class T>
 class Buffer {
  public:
@@ -31,12 +31,12 @@ class Buffer {
   Buffer& operator=(Buffer&&) = delete;
   ~Buffer() { free_block(data_); }
 
-  // Makes room for `size` elements. The contents are lost where the memory has to grow. Throws
-  // std::bad_alloc and is empty then.
+  // Makes room for `size` elements. The contents are lost if the memory has to grow. If it throws
+  // std::bad_alloc, the buffer is empty.
   T* resize(std::size_t size) {
     if (size > capacity_) {
       const std::size_t new_capacity = kExactBuffers ? size : size + size / 8;
-      // The old block is freed first, so that the two are never in memory at once.
+      // The old block is freed first, so that both are never in memory together.
       free_block(std::exchange(data_, nullptr));
       capacity_ = size_ = 0;
       data_ = static_cast<T*>(new_block(new_capacity * sizeof(T)));
@@ -59,7 +59,7 @@ class Buffer {
 
  private:
 #ifdef __SANITIZE_ADDRESS__
-  static constexpr bool kExactBuffers = true;  // so that the sanitizer sees a step past the end
+  static constexpr bool kExactBuffers = true;  // so that a sanitizer detects accesses past the end
 #else
   static constexpr bool kExactBuffers = false;
 #endif
@@ -74,13 +74,13 @@ struct Timings {
 };
 
 struct Frame {
-  bool rendered = false;  // whether the members below are those of a render that was completed
+  bool rendered = false;  // whether the members below are of a completed render
   RenderConfig config;
   std::int64_t gaussian_count = 0;             // N
   std::int64_t visible_count = 0;              // M
   Buffer<ProjectedGaussian> projected;         // [N], written for visible Gaussians only
   Buffer<std::uint16_t> visible;               // [N / 16], one bit for each Gaussian
-  Buffer<ColorDerivatives> color_derivatives;  // [N / 16], written where one of them is visible
+  Buffer<ColorDerivatives> color_derivatives;  // [N / 16], written if any of the 16 is visible
   Buffer<PairRange> pair_ranges;               // [N]
   Buffer<std::uint64_t> order;                 // [M] depth key << 32 | Gaussian, front to back
   Buffer<std::uint64_t> order_buffer;          // [N] the second array of the sort
@@ -89,7 +89,7 @@ struct Frame {
   Buffer<std::uint32_t> batch_offsets;         // [tiles + 1] into batches
   Buffer<std::uint32_t> composited_batches;    // [tiles] batches before the tile was saturated
   Buffer<SavedBatch> batches;                  // [batches]
-  Buffer<std::int64_t> tile_evaluations;       // [tiles] alphas that were computed
+  Buffer<std::int64_t> tile_evaluations;       // [tiles] number of computed alphas
   Timings timings;
 
   std::int64_t pair_count() const { return static_cast<std::int64_t>(entries.size()); }
@@ -98,9 +98,9 @@ struct Frame {
   std::int64_t bytes() const;
 };
 
-// Memory that is used within one forward or one backward pass and belongs to no view.
+// Temporary memory of one forward or backward pass.
 struct Workspace {
-  // The pairs of each chunk of Gaussians in depth order, front to back, in several segments.
+  // The pairs of each chunk of Gaussians, front to back, in several segments.
   std::vector<std::vector<Buffer<TileIntersection>>> intersections;
   Buffer<std::uint32_t> list_positions;       // [chunks, tiles], rows padded
   Buffer<std::uint32_t> histogram;            // of the depth sort
@@ -108,14 +108,14 @@ struct Workspace {
   Buffer<float> pair_grads;                   // [pairs, kPairGradStride]
 };
 
-// A frame or a workspace that was released before, or a new one. Throws std::bad_alloc.
+// Returns a released frame or workspace, or a new one. Throws std::bad_alloc.
 std::unique_ptr<Frame> acquire_frame();
 void release_frame(std::unique_ptr<Frame> frame) noexcept;
 std::unique_ptr<Workspace> acquire_workspace();
 void release_workspace(std::unique_ptr<Workspace> workspace) noexcept;
 
 #ifdef XRGS_FAULT_INJECTION
-// For tests only: the next render has to allocate everything.
+// Only for tests: the next render has to allocate all memory.
 void delete_unused_frames() noexcept;
 #endif
 

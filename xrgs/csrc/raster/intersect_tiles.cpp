@@ -1,8 +1,8 @@
 // Finds the tiles that each Gaussian's cutoff ellipse overlaps, in depth order.
 //
-// Most ellipses overlap few rows of tiles: sixteen Gaussians are processed together, one row of
-// tiles of each at a time. For a Gaussian that overlaps many rows, sixteen of its rows are
-// processed together.
+// Most ellipses overlap few rows of tiles: sixteen Gaussians are processed together, each with one
+// row of tiles at a time. For a Gaussian that overlaps many rows, sixteen of its rows are processed
+// together.
 #include "raster/cutoff_ellipse.h"
 #include "raster/stages.h"
 
@@ -36,14 +36,14 @@ XRGS_INLINE Ints last_tile(Floats position, int size) {
 
 XRGS_INLINE void find_columns(const CutoffEllipse& e, Floats tile_row, const RenderConfig& config,
                               TileColumns& out) {
-  // In a strip that is high enough the extent of the ellipse is that of its bounding box.
+  // In a sufficiently high strip, the extent is that of the bounding box.
   const float beyond = config.culling.tiles ? 0.0f : 1e9f;
   const Floats top =
       fma(tile_row, broadcast(static_cast<float>(kTileSize)), broadcast(0.5f - beyond));
   Floats left, right;
   const Mask overlaps =
       strip_extent(e, top, top + broadcast(kTileSize - 1.0f + 2.0f * beyond), left, right);
-  // The bound keeps the value within the range of an integer.
+  // Bounded to the range of integers.
   left = min(left, broadcast(static_cast<float>(config.width) + kTileSize));
   store(out.first, first_tile(left));
   store(out.last, last_tile(select(overlaps, right, broadcast(-1.0f)), config.width));
@@ -94,7 +94,7 @@ void intersect_group(Frame& frame, const std::uint64_t* order, int lanes, Inters
   std::uint32_t gaussian[16];
   Floats fields[16];
   for (int i = 0; i < 16; ++i) {
-    // Lanes past the end repeat the last Gaussian; their pairs are not written.
+    // Lanes past the end are copies of the last Gaussian; their pairs are not written.
     gaussian[i] = static_cast<std::uint32_t>(order[i < lanes ? i : lanes - 1]);
     fields[i] = load(&frame.projected[gaussian[i]].mean2d_x);
   }

@@ -2,7 +2,7 @@
 //
 // A Gaussian is visible if it is in front of the near plane, its opacity is at least alpha_min, and
 // the bounding box of its cutoff ellipse overlaps the image. With the culling options off,
-// Gaussians that fail one of the last two conditions are projected as well.
+// Gaussians that fail one of the last two conditions are projected too.
 #include <cstring>
 
 #include "raster/sh.h"
@@ -15,12 +15,11 @@ namespace {
 constexpr float kLog2e = 1.44269504f;
 constexpr float kSqrtLog2e = 1.20112241f;
 
-// Added to cutoff_radius_sq = log2(opacity / alpha_min), which is at most 8 with the default
-// alpha_min, so that rounding in the tests of tiles and blocks never drops a pixel.
+// Added to cutoff_radius_sq = log2(opacity / alpha_min), so that rounding in the tests of tiles and
+// blocks never drops a pixel. With the default alpha_min, cutoff_radius_sq is at most 8.
 constexpr float kCutoffMargin = 0.01f;
 
-// Zero where all inputs are finite, otherwise NaN: zero times a number is zero, zero times infinity
-// or NaN is NaN.
+// Zero if all inputs are finite, otherwise NaN: zero times infinity or NaN is NaN.
 XRGS_INLINE Floats sum_times_zero(const GaussianInputs& in) {
   const Floats zero = broadcast(0.0f);
   Floats sum = in.mean.x * zero;
@@ -36,7 +35,7 @@ XRGS_INLINE Mask valid_inputs(const GaussianInputs& in) {
          (zero <= min(in.scale.x, min(in.scale.y, in.scale.z)));
 }
 
-// The colours before the clamp at zero (Eq. 9), and what the backward pass needs of them.
+// The colours before the clamp at zero (Eq. 9), and their derivatives for the backward pass.
 template <int Degree>
 XRGS_INLINE Vector3 unclamped_colors(const GaussianParameters& p, std::int64_t group, int lanes,
                                      std::uint32_t visible, const Vector3& direction,
@@ -68,8 +67,8 @@ XRGS_INLINE Vector3 unclamped_colors(const GaussianParameters& p, std::int64_t g
   return color;
 }
 
-// A bit for each visible Gaussian. Sets kTooLarge for one that would be visible if float32 held its
-// size.
+// Returns a bit for each visible Gaussian. Sets kTooLarge for a Gaussian that would be visible, but
+// whose size overflows float32.
 XRGS_INLINE std::uint32_t find_visible(const Projection& o, const RenderConfig& config,
                                        Floats in_opacity, Floats cutoff_radius_sq,
                                        std::uint32_t existing, std::uint32_t* faults) {
@@ -83,7 +82,7 @@ XRGS_INLINE std::uint32_t find_visible(const Projection& o, const RenderConfig& 
     extent_y = select(o.huge, broadcast(kHugePixel) * extent_y, extent_y);
   }
   const Mask in_range = (o.det < broadcast(3e38f)) & (extent_x < huge) & (extent_y < huge);
-  const bool anywhere = !config.culling.out_of_view;  // then only what overflows is dropped
+  const bool anywhere = !config.culling.out_of_view;  // then only overflows are dropped
   const Floats left = anywhere ? -huge : zero;
   const Floats right = anywhere ? huge : broadcast(static_cast<float>(config.width));
   const Floats bottom = anywhere ? huge : broadcast(static_cast<float>(config.height));

@@ -1,10 +1,10 @@
 // The backward projection: from the rows of pair_grads to the gradients of the parameters.
 //
-// The rows of a Gaussian are added in the order in which its tiles were found, so the result does
-// not depend on the threads. The chain rule then leads back through the Cholesky factor of the
-// conic, the covariance, the projection, the rotation and the spherical harmonics (Eq. 19 to 32),
-// for sixteen Gaussians at a time; Gaussians that are not visible get zeros. The coefficients of
-// the harmonics are not read: see ColorDerivatives.
+// The rows of a Gaussian are added in the order of its tiles, so the result does not depend on the
+// threads. The chain rule is then applied to the Cholesky factor of the conic, the covariance, the
+// projection, the rotation and the spherical harmonics (Eq. 19 to 32), for sixteen Gaussians at a
+// time. Gaussians that are not visible get zeros. The coefficients of the harmonics are not read,
+// see ColorDerivatives.
 #include <cstring>
 
 #include "raster/sh.h"
@@ -14,8 +14,8 @@ namespace xrgs {
 namespace XRGS_NS {
 namespace {
 
-// Rows of a Gaussian that are added without a branch, missing ones as zeros: most Gaussians have no
-// more, and their number is not predictable.
+// Number of a Gaussian's rows that are added without a branch, with zeros for missing rows. Most
+// Gaussians have no more rows, and their number is unpredictable for the processor.
 constexpr std::uint32_t kFewPairs = 4;
 alignas(64) constexpr float kNoPair[kPairGradStride] = {};
 
@@ -42,14 +42,13 @@ struct ConicGradient {
   Floats mean_x, mean_y;
 };
 
-// Through u = xx dx - xy dy, v = yy dy and ln alpha = ln(opacity) - u^2 - v^2 to the factor of the
-// conic, and from there to the covariance (Eq. 20, 22 and 23).
+// The gradients of the conic's factor, from u = xx dx - xy dy, v = yy dy and ln alpha = ln(opacity)
+// - u^2 - v^2, and from these the gradients of the covariance (Eq. 20, 22 and 23).
 XRGS_INLINE ConicGradient conic_factor_backward(const Projection& o, const Floats (&sum)[16]) {
   const ConicFactor factor = conic_factor(o);
   const Floats two = broadcast(2.0f);
   const Floats inv_yy = broadcast(1.0f) / o.yy;
-  // Half the gradients of ln(factor.xx), with factor.xy / factor.xx held fixed, and of
-  // ln(factor.yy).
+  // Half the gradients of ln(factor.xx), for constant factor.xy / factor.xx, and of ln(factor.yy).
   const Floats half_v_log_xx = -sum[kGradUU];
   const Floats half_v_log_yy = -(factor.yy * factor.yy * sum[kGradDyDy]);
   const Floats v_factor_xy = two * sum[kGradUDy];
@@ -102,14 +101,14 @@ XRGS_INLINE void quaternion_backward(const Rotation& r, const Vector3 (&v)[3], F
     for (int i = 0; i < 4; ++i) out[i] = select(r.tiny, broadcast(kTinyScale) * out[i], out[i]);
 }
 
-// Changes sums over pixels to those in the pixels of huge Gaussians.
+// Converts sums over pixels to units of the large pixels for huge Gaussians (kHugePixel).
 XRGS_INLINE void to_huge_pixels(Floats unit, Floats (&sum)[16]) {
   sum[kGradDy] = unit * sum[kGradDy];
   sum[kGradUDy] = unit * sum[kGradUDy];
   sum[kGradDyDy] = unit * (unit * sum[kGradDyDy]);
 }
 
-// Changes a projection and the gradients of its rows of M and of its mean to those in pixels.
+// Converts a projection, and the gradients of its rows of M and of its mean, to pixels.
 XRGS_INLINE void to_pixels(Projection& o, ConicGradient& v, Vector3& v_m_x, Vector3& v_m_y) {
   const Floats inv_unit = select(o.huge, broadcast(kHugePixel), broadcast(1.0f));
   o.m_x = times(inv_unit, o.m_x);
@@ -125,8 +124,8 @@ struct GeometryGradient {
   Floats quat[4];
 };
 
-// Whether all gradients of the visible Gaussians are finite. Those of shN are products of the
-// gradient of the colour and a basis function, none of which is above 1.
+// Whether all gradients of the visible Gaussians are finite. The gradients of shN need no test:
+// they are products of the colour's gradient and a basis function, which is at most 1.
 XRGS_INLINE bool all_finite(const GeometryGradient& v, const Vector3& v_color, Floats v_opacity,
                             Floats v_offset_x, Floats v_offset_y, std::uint32_t visible) {
   const Floats zero = broadcast(0.0f);
@@ -138,7 +137,8 @@ XRGS_INLINE bool all_finite(const GeometryGradient& v, const Vector3& v_color, F
   return (visible & ~to_bits(sum == zero)) == 0;
 }
 
-// From the rows of M and the projected mean to means, scales and quaternions (Eq. 26 to 30).
+// The gradients of means, scales and quaternions, from those of the rows of M and of the projected
+// mean (Eq. 26 to 30).
 XRGS_INLINE GeometryGradient projection_backward(const Projection& o, const RenderConfig& config,
                                                  const GaussianInputs& in, const Vector3& v_m_x,
                                                  const Vector3& v_m_y, Floats v_mean2d_x,
@@ -181,8 +181,8 @@ XRGS_INLINE GeometryGradient projection_backward(const Projection& o, const Rend
   return out;
 }
 
-// Writes the gradients of sixteen Gaussians to an array [N, width]: straight to its rows or, for a
-// group that is not whole, to a buffer that copy_out() copies to them.
+// Writes the gradients of sixteen Gaussians to an array [N, width]: directly to its rows, or for an
+// incomplete group to a buffer that copy_out() copies to the rows.
 struct GroupWriter {
   std::int64_t group;
   int lanes;
@@ -200,8 +200,8 @@ void zero_floats(float* p, std::int64_t count) {
   std::memset(p, 0, static_cast<std::size_t>(count) * 4);
 }
 
-// Writes the gradients of sh0 and, where it is wanted, of shN (Eq. 31). Sets v to the gradient of
-// the colour, and returns that of the mean that comes from the viewing direction (Eq. 32).
+// Writes the gradients of sh0 and, if wanted, of shN (Eq. 31). Sets v to the gradient of the
+// colour, and returns the gradient of the mean through the viewing direction (Eq. 32).
 template <int Degree>
 XRGS_INLINE Vector3 color_backward(const GaussianParameters& p, const RenderConfig& config,
                                    const GaussianInputs& in, const ColorDerivatives& derivatives,
@@ -254,7 +254,7 @@ void write_zeros(const GaussianParameters& p, std::int64_t group, int lanes,
   if (out.means2d_offset != nullptr) zero_floats(out.means2d_offset + group * 2, lanes * 2);
 }
 
-// Writes the gradients of all parameters but the colours.
+// Writes the gradients of all parameters except the colours.
 void write_geometry(const GeometryGradient& v, Floats v_opacity, Floats v_mean2d_x,
                     Floats v_mean2d_y, Mask visible, std::int64_t group, int lanes,
                     const ParameterGradients& out) {

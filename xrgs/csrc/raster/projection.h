@@ -8,15 +8,15 @@
 namespace xrgs {
 namespace XRGS_NS {
 
-// How far beyond the image the Jacobian is evaluated, as a share of half the field of view: the 1.3
-// of gsplat and of the original 3DGS code, around the true principal point (Eq. 3).
+// How far outside the image the Jacobian may be evaluated, as a fraction of half the field of view
+// (Eq. 3): the 1.3 of gsplat and of the original 3DGS code, around the true principal point.
 constexpr float kClampMargin = 0.3f;
 
-// From this depth on, in world units, a Gaussian is not visible: the reciprocal would be denormal.
+// Gaussians at this depth or farther, world units, are not visible: its reciprocal is denormal.
 constexpr float kDepthEnd = 8e37f;
 
-// Where the determinant of the 2D covariance is this or more, px^4, the image plane is measured in
-// pixels of 2^32 px: neither the determinant nor the gradient by it leaves the range of float32.
+// If the determinant of the 2D covariance is kHugeDet px^4 or more, the unit of the image plane is
+// kHugePixel px, so that the determinant and its gradient are in the range of float32.
 constexpr float kHugeDet = 1e30f, kHugePixel = 4294967296.0f;
 
 struct Vector3 {
@@ -52,8 +52,8 @@ struct PaddedRows {
   }
 };
 
-// Loads the Gaussians group..group+lanes-1, and activates them where they are `raw`. Lanes past the
-// last Gaussian read zeros.
+// Loads the Gaussians group..group+lanes-1, and applies the activation functions if `raw`. Lanes
+// past the last Gaussian are zeros.
 XRGS_INLINE GaussianInputs load_inputs(const GaussianParameters& p, bool raw, std::int64_t group,
                                        int lanes) {
   GaussianInputs in;
@@ -75,7 +75,7 @@ XRGS_INLINE GaussianInputs load_inputs(const GaussianParameters& p, bool raw, st
 }
 
 // A unit quaternion, its rotation matrix, and 1 / the length of the quaternion before
-// normalisation. Where it is tiny, inv_length is that of kTinyScale times the quaternion.
+// normalisation. For a tiny quaternion, inv_length is that of kTinyScale times the quaternion.
 struct Rotation {
   Floats w, x, y, z, inv_length;
   Mask tiny;
@@ -87,8 +87,8 @@ constexpr float kSmallestNormal = 1.17549435e-38f;
 // Quaternions whose components are all below the first number are multiplied by the second, 2^64.
 constexpr float kTinyQuaternion = 1.0842022e-19f, kTinyScale = 18446744073709551616.0f;
 
-// kTinyScale times a tiny number. Denormal numbers, which arithmetic takes for zeros, are read as
-// what they are, the multiple of 2^-149 that their bits say.
+// kTinyScale times a tiny number. Arithmetic treats denormal numbers as zeros, so these are
+// converted as integers, multiples of 2^-149.
 XRGS_INLINE Floats scale_tiny(Floats a) {
   const Floats unit = broadcast(2.5849394e-26f);  // kTinyScale 2^-149
   const Floats sign = to_floats(shift_right<31>(as_ints(a)));  // 0 or -1
@@ -97,11 +97,10 @@ XRGS_INLINE Floats scale_tiny(Floats a) {
                 broadcast(kTinyScale) * a);
 }
 
-// The zero quaternion is read as the identity, and its inv_length is zero, so it has no gradient.
+// The zero quaternion becomes the identity, with an inv_length of zero, so it has no gradient.
 XRGS_INLINE Rotation quat_to_rotation(const GaussianInputs& in) {
-  // Dividing by the largest component first keeps the squares of tiny and of huge quaternions in
-  // range.
-  // Both are divided by four before, as the reciprocal of the largest numbers is denormal.
+  // Divided by the largest component first, so that the squares neither overflow nor underflow.
+  // Both are divided by four before, since the reciprocal of the largest numbers is denormal.
   const Floats one = broadcast(1.0f), quarter = broadcast(0.25f);
   Floats qw = in.qw, qx = in.qx, qy = in.qy, qz = in.qz;
   Floats largest = max(max(abs(qw), abs(qx)), max(abs(qy), abs(qz)));
@@ -133,7 +132,7 @@ XRGS_INLINE Rotation quat_to_rotation(const GaussianInputs& in) {
   return r;
 }
 
-// Everything between the parameters and the conic that the forward and the backward pass need.
+// All intermediate values between the parameters and the conic, for forward and backward pass.
 struct Projection {
   Floats x, y, z, inv_z;    // the mean in camera coordinates (Eq. 1)
   Floats slope_x, slope_y;  // x/z and y/z, clamped (Eq. 3)
@@ -149,8 +148,8 @@ struct Projection {
   Floats opacity;         // compensated if antialiased (Eq. 10)
   Floats mean_x, mean_y;  // px (Eq. 2)
   Mask in_front;          // of the near plane, and nearer than kDepthEnd
-  Mask huge;              // where m_x, m_y and what follows from them are in pixels of kHugePixel
-  Floats unit;            // 1 / kHugePixel there, elsewhere 1
+  Mask huge;              // whether m_x, m_y and values derived from them are in kHugePixel px
+  Floats unit;            // 1 / kHugePixel if huge, else 1
 };
 
 // Clamps a slope to the field of view and a margin (Eq. 3); `size` is the width or height in px.
@@ -163,7 +162,7 @@ XRGS_INLINE Floats clamp_slope(Floats slope, float focal, float centre, float si
   return clamp(slope, low, high);
 }
 
-// Sets what follows from m_x, m_y and eps (Eq. 5 and 6).
+// Sets the members that are derived from m_x, m_y and eps (Eq. 5 and 6).
 XRGS_INLINE void set_covariance(Projection& o) {
   o.normal = cross(o.m_x, o.m_y);
   const Floats xx = dot(o.m_x, o.m_x), yy = dot(o.m_y, o.m_y), det2d = dot(o.normal, o.normal);

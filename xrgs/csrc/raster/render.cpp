@@ -15,7 +15,7 @@
 namespace xrgs {
 namespace {
 
-// Measures the milliseconds since it was made, or since the last call.
+// Measures the time since its construction, or since the last call, ms.
 class StageTimer {
  public:
   double elapsed_ms() {
@@ -60,7 +60,7 @@ void compact_sort_keys(int threads, std::int64_t chunks, const std::int32_t* vis
   });
 }
 
-// Projects all Gaussians. Returns the bits of what is wrong with them.
+// Projects all Gaussians. Returns the bits of their faults.
 std::uint32_t project_chunks(int threads, const RasterKernels& kernels,
                              const GaussianParameters& p, Frame& frame, Workspace& workspace) {
   const std::size_t count = static_cast<std::size_t>(p.count);
@@ -86,10 +86,10 @@ std::uint32_t project_chunks(int threads, const RasterKernels& kernels,
   return all_faults.load();
 }
 
-// Calls body(tile) for every tile: several that are side by side in one task, because neighbours
-// share cache lines of the image, and each tile prefetches the next. Where each thread has few
-// tiles, those with the longest lists are started first, one by one, so that no thread works on a
-// long one alone at the end.
+// Calls body(tile) for every tile. A task has several adjacent tiles, because these share cache
+// lines of the image, and each tile prefetches the next one. If there are few tiles for each
+// thread, tiles with the longest lists are started first, one by one, so that the threads finish
+// together.
 template <class Body>
 void for_each_tile(int threads, const Frame& frame, Body&& body) {
   constexpr std::int64_t kFewTilesPerThread = 128;

@@ -87,8 +87,8 @@ XRGS_INLINE Vector3 sh_direction_gradient(const Vector3& d, const Floats* coeffi
 }
 
 // Loads sixteen rows of `Width` floats, `stride` apart, as columns. Rows whose bit in `rows` is not
-// set are not read and give zeros. The last vector of a row overlaps the one before where it would
-// reach past the row: a masked load that crosses a cache line takes several times as long.
+// set are not read, and give zeros. If the last vector of a row would reach past its end, it
+// overlaps the vector before, since masked loads across cache lines are several times slower.
 template <int Width>
 XRGS_INLINE void load_columns(const float* p, std::int64_t stride, std::uint32_t rows,
                               Floats* out) {
@@ -106,8 +106,8 @@ XRGS_INLINE void load_columns(const float* p, std::int64_t stride, std::uint32_t
   }
 }
 
-// The Gaussians whose shN is loaded: all of them where at least half are visible, because then the
-// tests would cost more than the loads that they avoid.
+// The Gaussians whose shN is loaded: the visible ones, but all if at least half are visible,
+// because then the tests would take longer than the loads that they avoid.
 XRGS_INLINE std::uint32_t rows_to_load(std::uint32_t visible, int lanes) {
   return __builtin_popcount(visible) >= 8 ? (1u << lanes) - 1u : visible;
 }
@@ -123,9 +123,8 @@ XRGS_INLINE Vector3 view_direction(const Vector3& mean, const float* camera_posi
   return times(inv_distance, from_camera);
 }
 
-// What the gradients of shN of sixteen Gaussians are made of: a row of basis functions of degree 1
-// and higher for each, with zeros behind them, and the gradients of the colours before the clamp,
-// one Gaussian after the other.
+// The factors of the gradients of shN for sixteen Gaussians: rows of basis functions of degree 1
+// and higher, padded with zeros, and the gradients of the colours before the clamp.
 struct ShGradientFactors {
   alignas(64) float basis[16][16];  // repeat_thrice of the last row reads one float of v_color
   alignas(64) float v_color[16 * 3 + 16];
@@ -146,7 +145,7 @@ struct ShGradientRows {
   alignas(64) float rows[16 * 3 * rest_basis_count(3) + 16] = {};
 };
 
-// Writes floats 16 C to 16 C + 15 of a Gaussian's row, with zeros behind its last band.
+// Writes floats 16 C to 16 C + 15 of a Gaussian's row, with zeros after its last band.
 template <int Degree, int C>
 XRGS_INLINE void store_gradient_part(const float* basis, const float* v_color, float* row) {
   constexpr int kLeft = 3 * rest_basis_count(Degree) - 16 * C;
@@ -158,8 +157,8 @@ XRGS_INLINE void store_gradient_part(const float* basis, const float* v_color, f
 }
 
 // Writes the gradient of Gaussian i of sixteen, whose rows are `stride` floats apart: the basis
-// times the gradient of the colour (Eq. 31). Zeros fill up the last vector: where they lie in the
-// next row, this must be written later.
+// times the gradient of the colour (Eq. 31). The last vector is padded with zeros, which may reach
+// into the next row: so rows must be written in ascending order.
 template <int Degree>
 XRGS_INLINE void store_gradient_row(const ShGradientFactors& factors, int i, std::int64_t stride,
                                     ShGradientRows& out) {

@@ -1,5 +1,5 @@
-// The kernels of one instruction set, each defined in the file of its name. raster_kernels.h
-// documents them.
+// The kernels of one instruction set, each defined in the file of its name and documented in
+// raster_kernels.h.
 #pragma once
 
 #include "raster/frame.h"

@@ -1,4 +1,4 @@
-// One batch of a tile's Gaussians: at most kBatchSize of them, copied side by side, with the tile's
+// A batch of at most kBatchSize of a tile's Gaussians, copied to contiguous memory, with the tile's
 // centre as the origin of x and y.
 #pragma once
 
@@ -12,8 +12,8 @@
 namespace xrgs {
 namespace XRGS_NS {
 
-// The Gaussians of a batch, one row each, in the layout of ProjectedGaussian. The last row is one
-// that is transparent everywhere: lists are filled up with it to a multiple of kUnroll.
+// The Gaussians of a batch, one row each, in the layout of ProjectedGaussian. The last row is a
+// transparent Gaussian, with which lists are padded to a multiple of kUnroll.
 using BatchRows = float[kBatchSize + 1][16];
 enum BatchField { kX, kY, kCholXX, kCholXY, kCholYY, kLog2Opacity, kRed, kGreen, kBlue };
 
@@ -33,7 +33,7 @@ struct Tile {
   float centre_y() const { return static_cast<float>(row * kTileSize) + 0.5f * kTileSize; }
 };
 
-// The positions of the sixteen pixel centres of a block, from the tile's centre.
+// The positions of the sixteen pixel centres of a block, relative to the tile's centre.
 XRGS_INLINE Floats pixels_x(int block) {
   alignas(64) float x[16];
   for (int i = 0; i < 16; ++i) x[i] = static_cast<float>(4 * (block % 4) + i % 4) - 7.5f;
@@ -46,7 +46,7 @@ XRGS_INLINE Floats pixels_y(int block) {
 }
 
 // Loads the projected Gaussians of `count` (1 to 16) entries into rows first..first+15 of a batch,
-// with `centre` subtracted; rows past the end repeat the last one.
+// with `centre` subtracted; rows past the end are copies of the last row.
 XRGS_INLINE void load_projected(const Frame& frame, const TileEntry* entries, int count,
                                 Floats centre, BatchRows& rows, int first) {
   for (int i = 0; i < 16; ++i) {
@@ -62,8 +62,8 @@ XRGS_INLINE void load_fields(const BatchRows& rows, int first, Floats (&out)[16]
 }
 
 // Prefetches one of kBlocksPerTile parts of the projected Gaussians of the batch that begins at
-// entry `first`: a processor has too few buffers for all of them at once, so each block fetches a
-// part.
+// entry `first`. Each block prefetches a part, since a processor has too few buffers for the whole
+// batch.
 XRGS_INLINE void prefetch_part(const Frame& frame, std::size_t first, int part) {
   constexpr std::size_t kPart = kBatchSize / kBlocksPerTile;
   const std::size_t pairs = frame.entries.size(),
@@ -72,10 +72,10 @@ XRGS_INLINE void prefetch_part(const Frame& frame, std::size_t first, int part) 
     prefetch(&frame.projected[frame.entries[i].gaussian]);
 }
 
-// Blocks between the prefetch of what the frame saves of a batch and its use.
+// Number of blocks between the prefetch of a block's saved data in the frame and its use.
 constexpr int kBlocksAhead = 2;
 
-// The index of the first pixel of a row of a tile, or -1 where the row is below the image.
+// The index of the first pixel of a row of a tile, or -1 if the row is below the image.
 XRGS_INLINE std::int64_t row_start(const Tile& tile, const RenderConfig& config, int row) {
   const int y = tile.row * kTileSize + row;
   return y < config.height ? std::int64_t{y} * config.width + tile.column * kTileSize : -1;
@@ -104,9 +104,9 @@ struct AlphaThresholds {
         transmittance_min(broadcast(config.transmittance_min)) {}
 };
 
-// Gaussians that are composited side by side: each operation of one waits several cycles for the
-// one before, and those of the other fill the gaps. Longer lists would gain from four, but lists
-// are filled up to a multiple of it, and those of small images have some fifteen Gaussians.
+// Number of Gaussians whose alphas are computed together, to hide the latency of the operations.
+// Four would be faster for long lists, but lists are padded to a multiple, and those of small
+// images have only about fifteen Gaussians.
 constexpr int kUnroll = 2;
 
 // u and v of a Gaussian g of the batch at sixteen pixels (Eq. 8).
@@ -152,8 +152,8 @@ struct BlockRegion {
   bool whole() const { return width == 4 && height == 4; }
 };
 
-// Copies a block with `Channels` floats a pixel between two arrays whose rows are from_stride and
-// to_stride floats apart. Only the part inside the image is copied.
+// Copies the part of a block inside the image, with `Channels` floats per pixel, between two arrays
+// whose rows are from_stride and to_stride floats apart.
 template <int Channels>
 XRGS_INLINE void copy_block(const float* from, std::int64_t from_stride, float* to,
                             std::int64_t to_stride, const BlockRegion& region) {

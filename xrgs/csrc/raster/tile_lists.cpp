@@ -1,8 +1,7 @@
-// A stable counting sort of the (tile, Gaussian) pairs by tile. The pairs come in depth order, so
-// each list is in depth order as well; gsplat sorts (tile, depth) keys instead.
+// A stable counting sort of the (tile, Gaussian) pairs by tile. The pairs are in depth order, so
+// each list is in depth order too; gsplat sorts (tile, depth) keys instead.
 //
-// A pair also has a row of pair_grads. The rows of a Gaussian are adjacent, in the order of the
-// Gaussians.
+// Each pair has a row of pair_grads. The rows are sorted by Gaussian.
 #include "raster/tile_lists.h"
 
 #include <algorithm>
@@ -17,12 +16,12 @@ namespace {
 
 constexpr std::int64_t kMinChunk = 4096;  // Gaussians
 constexpr std::int64_t kSegmentPairs = 1 << 16;
-// Counts are kept apart by so many that those of two chunks are never in the same pair of cache
-// lines: two threads that write to one line wait for each other at each write.
+// Alignment of the counts of each chunk, so that two chunks never share a pair of cache lines:
+// threads that write to the same line wait for each other at each write.
 constexpr std::int64_t kCountsAlignment = 32;
 
 // Writes the pairs of Gaussians first..last-1 of the depth order, segment by segment. Returns false
-// where memory ran out.
+// if memory is exhausted.
 bool intersect_chunk(const RasterKernels& kernels, Frame& frame, std::int64_t first,
                      std::int64_t last, std::vector<Buffer<TileIntersection>>& segments,
                      std::uint32_t* tile_counts) {
@@ -43,8 +42,8 @@ bool intersect_chunk(const RasterKernels& kernels, Frame& frame, std::int64_t fi
   return true;
 }
 
-// Turns counts [chunks, stride], of which the first `tiles` of each row are used, into the position
-// of each chunk's first entry in each tile's list, and fills tile_offsets and batch_offsets.
+// Converts counts [chunks, stride], with `tiles` used columns, to the position of each chunk's
+// first entry in each tile's list, and fills tile_offsets and batch_offsets.
 void counts_to_positions(std::int64_t chunks, std::int64_t tiles, std::int64_t stride,
                          std::uint32_t* counts, Frame& frame) {
   std::int64_t position = 0, batch = 0;
@@ -64,8 +63,7 @@ void counts_to_positions(std::int64_t chunks, std::int64_t tiles, std::int64_t s
   frame.batch_offsets[static_cast<std::size_t>(tiles)] = static_cast<std::uint32_t>(batch);
 }
 
-// Assigns rows of pair_grads to each Gaussian, as many as it has pairs. Returns the number of all
-// pairs.
+// Assigns a row of pair_grads to each pair of each Gaussian. Returns the total number of pairs.
 std::int64_t assign_pair_ranges(int threads, Frame& frame) {
   constexpr std::int64_t kGaussiansPerTask = 1 << 15;
   const auto count = static_cast<std::int64_t>(frame.pair_ranges.size());
@@ -133,8 +131,8 @@ void build_tile_lists(int threads, const RasterKernels& kernels, Frame& frame,
   });
   if (!allocation_ok) throw std::bad_alloc();
 
-  // Positions are 32-bit. Memory ends far below that bound: the backward pass needs 64 bytes a
-  // pair.
+  // Positions have 32 bits. Memory is exhausted far below that limit: the backward pass needs 64
+  // bytes for each pair.
   const std::int64_t pairs = assign_pair_ranges(threads, frame);
   if (pairs > std::numeric_limits<std::uint32_t>::max()) throw std::bad_alloc();
 

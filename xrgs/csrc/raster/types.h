@@ -1,6 +1,5 @@
-// The data that the stages of the rasterizer pass to one another: plain structs, the same for every
-// instruction set. docs/rasterizer.md describes the stages and derives the equations that the
-// comments refer to.
+// The data between the stages of the rasterizer, as plain structs for all instruction sets.
+// docs/rasterizer.md describes the stages, and derives the equations that comments refer to.
 #pragma once
 
 #include <cstdint>
@@ -16,12 +15,12 @@ constexpr int kMaxShDegree = 3;      // of the spherical harmonics
 // The number of basis functions of degree 1 to `degree`: K - 1 of shN [N, K - 1, 3].
 constexpr int rest_basis_count(int degree) { return (degree + 1) * (degree + 1) - 1; }
 
-// The largest magnitude of a colour and of the background. A pixel is a mean of both, so it cannot
-// overflow.
+// The largest magnitude of a colour and of the background, so that their weighted mean in a pixel
+// can't overflow.
 constexpr float kLargestColor = 1e38f;
 
-// Work that the rasterizer leaves out. Each option skips one kind of work while it is true; the
-// image is the same either way, to rounding at the thresholds.
+// Work that the rasterizer skips. Each option, if true, skips one kind of work; apart from rounding
+// at the thresholds, the image does not depend on it.
 struct CullingOptions {
   bool out_of_view;    // Gaussians whose bounding box (Eq. 12) does not overlap the image
   bool sub_threshold;  // Gaussians whose opacity is below alpha_min
@@ -54,9 +53,9 @@ struct RenderConfig {
   std::int64_t tile_count() const { return std::int64_t{tile_columns()} * tile_rows(); }
 };
 
-// Why a render has no image.
+// Faults for which a render has no image.
 constexpr std::uint32_t kWrongParameter = 1;  // not finite or out of range
-constexpr std::uint32_t kTooLarge = 2;        // a Gaussian is larger than float32 can hold, in px
+constexpr std::uint32_t kTooLarge = 2;        // a Gaussian's size in px overflows float32
 
 // The Gaussians: float32, contiguous; scales and opacities as RenderConfig::raw says.
 struct GaussianParameters {
@@ -67,23 +66,23 @@ struct GaussianParameters {
   const float* opacities;       // [N]
   const float* sh0;             // [N, 3]
   const float* shN;             // [N, rest_count, 3]
-  int rest_count;               // basis functions above degree 0 that are stored, at most 15
+  int rest_count;               // number of stored basis functions above degree 0, at most 15
   const float* means2d_offset;  // [N, 2] px added to the projected means, or null
 };
 
-// The arrays that receive the gradients of the parameters; shapes as above.
+// The arrays for the gradients of the parameters, with the shapes above.
 struct ParameterGradients {
   float *means, *quats, *scales, *opacities, *sh0;
-  float* shN;             // null where it is not needed
-  float* means2d_offset;  // null where it is not needed
+  float* shN;             // null if not needed
+  float* means2d_offset;  // null if not needed
 };
 
 // A visible Gaussian in the image plane: one cache line. With d = pixel centre - mean2d,
 //   u = chol_xx dx - chol_xy dy,  v = chol_yy dy,  alpha = 2^(log2_opacity - u^2 - v^2)
 // (Eq. 7 and 8).
-// chol_* is the Cholesky factor of the conic (the inverse of the 2D covariance), scaled so that the
-// exponent is one of base 2. Conics as gsplat stores them, a dx^2 + 2 b dx dy + c dy^2, lose all
-// digits to cancellation for a long thin Gaussian; a sum of squares does not.
+// chol_* is the Cholesky factor of the conic (the inverse of the 2D covariance), scaled for an
+// exponent of base 2. gsplat's form of the conic, a dx^2 + 2 b dx dy + c dy^2, loses all digits to
+// cancellation for a long thin Gaussian; a sum of squares does not.
 struct alignas(64) ProjectedGaussian {
   float mean2d_x, mean2d_y;         // px
   float chol_xx, chol_xy, chol_yy;  // px^-1; chol_xy has the sign of the covariance
@@ -103,25 +102,24 @@ struct TileEntry {
   std::uint32_t pair;  // row of pair_grads that belongs to this (tile, Gaussian) pair
 };
 
-// How the colours of sixteen Gaussians change with the viewing direction. The forward pass stores
-// this so that the backward pass need not read the spherical harmonics again, three quarters of the
-// parameters.
+// Derivatives of the colours of sixteen Gaussians with respect to the viewing direction. The
+// forward pass stores them, so that the backward pass does not read the spherical harmonics, three
+// quarters of the parameters.
 struct alignas(64) ColorDerivatives {
   // d(red)/dx, d(red)/dy, d(red)/dz, d(green)/dx, ... of the colour before the clamp at 0.
   float dcolor_ddir[9][16];
-  // For red, green and blue: bit i is set where the colour of Gaussian i is not clamped.
+  // For red, green and blue: bit i is set if the colour of Gaussian i is not clamped.
   std::uint16_t unclamped[3];
 };
 
-// The (tile, Gaussian) pairs of one Gaussian: rows first..first + count - 1 of pair_grads. They are
-// numbered in the order of the Gaussians, so the backward projection reads them one after the
-// other.
+// The (tile, Gaussian) pairs of a Gaussian: rows first..first + count - 1 of pair_grads. Rows are
+// sorted by Gaussian, so the backward projection reads them sequentially.
 struct PairRange {
   std::uint32_t first;
   std::uint32_t count;
 };
 
-// A (tile, Gaussian) pair as tile intersection writes it, front to back.
+// A (tile, Gaussian) pair of the stage intersect_tiles, in front-to-back order.
 struct TileIntersection {
   std::uint32_t tile;
   std::uint32_t gaussian;
@@ -130,9 +128,9 @@ struct TileIntersection {
 // The columns of pair_grads [pairs, kPairGradStride]: sums over the pixels of a pair. With
 // g = dL/d(ln alpha), w = alpha T, and u and dy as in Eq. 8, they are
 //   g, g u, g dy, g u^2, g u dy, g dy^2, and w v_image for each colour (Eq. 18);
-// with absgrad also |dL/d(mean2d)| for x and y (Eq. 21), else zeros. Powers of u, and not of dx,
-// because the sum of g u^2 over a long thin Gaussian is a small difference of those of g dx^2,
-// g dx dy and g dy^2.
+// with absgrad also |dL/d(mean2d)| for x and y (Eq. 21), else zeros. Powers of u are used instead
+// of dx, because for a long thin Gaussian the sum of g u^2 would be a small difference of the sums
+// of g dx^2, g dx dy and g dy^2.
 enum PairGradField {
   kGrad,
   kGradU,
@@ -149,7 +147,7 @@ enum PairGradField {
 };
 constexpr int kPairGradStride = 16;  // floats: one cache line
 
-// What the forward pass keeps of one batch of one tile for the backward pass.
+// The data of one batch of a tile that the forward pass saves for the backward pass.
 struct SavedBatch {
   std::uint8_t counts[kBlocksPerTile];             // Gaussians that each block composited
   std::uint8_t lists[kBlocksPerTile][kBatchSize];  // their positions in the batch, front to back

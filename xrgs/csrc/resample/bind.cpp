@@ -72,7 +72,7 @@ Output resample(Image image, First row_first, Weights row_weights, First column_
   Output out = new_array<float>({new_height, new_width, 3});
   float* to = static_cast<float*>(out.data());
   nb::gil_scoped_release release;
-  // The pass across comes where the image has fewer rows.
+  // The pass along the rows runs when the image has fewer rows: before or after the other pass.
   if (new_height <= height) {
     const OwnedBlock intermediate = acquire_block(3 * new_height * width * sizeof(float));
     float* between = static_cast<float*>(intermediate->data);

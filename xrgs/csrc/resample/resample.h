@@ -1,5 +1,5 @@
-// Multiplies an image by a banded matrix along its rows and another along its columns, which is how
-// images are resized.
+// Resizes an image by multiplying it by a banded matrix along its rows and another along its
+// columns.
 #pragma once
 
 #include <cstddef>
@@ -22,10 +22,10 @@ struct ResampleKernels {
   void (*down)(const BandedMatrix& rows, const float* in, std::size_t columns, int first, int last,
                float* out);
   // Resamples along the rows: writes `rows` (at most 16) rows of out [., columns.count, 3], given
-  // as many of in [., width, 3].
+  // the same number of rows of in [., width, 3].
   void (*across)(const BandedMatrix& columns, const float* in, int width, int rows, float* out,
                  float* scratch);
-  // Returns the floats of scratch that one call of `across` needs, on a 64-byte boundary.
+  // Returns the number of floats in the `scratch` of `across`, which must be 64-byte aligned.
   std::size_t (*scratch_size)(int width);
 };
 

@@ -1,5 +1,5 @@
-// Down the image, a vector is sixteen adjacent floats of a row. Across it, a vector is the same
-// float of sixteen rows, so that a weight applies to whole vectors whatever the distance between
+// Along the columns, a vector is sixteen adjacent floats of a row. Along the rows, a vector is the
+// same float of sixteen rows, so that a weight multiplies whole vectors for any distance between
 // taps.
 #include "resample/resample.h"
 #include "simd/simd.h"

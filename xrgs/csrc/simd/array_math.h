@@ -1,5 +1,5 @@
-// exp2, log2 and sqrt_upper_bound of simd.h over whole arrays, so that tests can call them, and
-// what an instruction set says of its arithmetic.
+// exp2, log2 and sqrt_upper_bound of simd.h for whole arrays, so that tests can call them, and the
+// property of an instruction set's arithmetic.
 #pragma once
 
 #include <cstdint>

@@ -1,4 +1,4 @@
-// The operations of simd.h for AVX2 with FMA: two registers a vector.
+// The operations of simd.h for AVX2 with FMA: two registers for each vector.
 #pragma once
 
 #include <immintrin.h>
@@ -8,7 +8,7 @@
 namespace xrgs {
 namespace XRGS_NS {
 
-// The number of vectors that the registers hold.
+// The number of vectors that fit in the registers.
 constexpr int kVectorRegisters = 8;
 constexpr bool kFusedMultiplyAdd = true;
 
@@ -31,7 +31,7 @@ XRGS_INLINE void store(float* p, Floats a) {
   _mm256_storeu_ps(p, a.lo);
   _mm256_storeu_ps(p + 8, a.hi);
 }
-// All bits set in each of the lanes from..from+7 whose number is below `count`.
+// A mask of lanes from..from+7: all bits are set in lanes with an index below `count`.
 XRGS_INLINE __m256i lanes_below(int count, int from) {
   const __m256i lane =
       _mm256_add_epi32(_mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7), _mm256_set1_epi32(from));
@@ -174,8 +174,8 @@ XRGS_INLINE Floats broadcast_row(Floats a) {
   const __m256 row = _mm256_permute2f128_ps(half, half, (R & 1) * 0x11);
   return {row, row};
 }
-// The lanes k of p[(16 C + k) / 3], which may read up to p[16], and of p[(16 C + k) % 3], which may
-// read up to p[3]. C is 0 to 2.
+// repeat_thrice has p[(16 C + k) / 3] in lane k, and may read up to p[16]. repeat_triple has
+// p[(16 C + k) % 3] in lane k, and may read up to p[3]. C is 0 to 2.
 template <int K>  // eight lanes from K on
 XRGS_INLINE __m256 repeat_thrice8(const float* p) {
   constexpr int first = K / 3, r = K % 3;
@@ -248,5 +248,5 @@ XRGS_INLINE void stream_fence() { _mm_sfence(); }
 }  // namespace XRGS_NS
 }  // namespace xrgs
 
-// The operations that this instruction set has no better form of.
+// General forms of the remaining operations.
 #include "simd/generic.h"

@@ -1,4 +1,4 @@
-// The operations of simd.h for AVX-512 (F, DQ, BW and VL): one register a vector.
+// The operations of simd.h for AVX-512 (F, DQ, BW and VL): one register for each vector.
 #pragma once
 
 #include <immintrin.h>
@@ -8,7 +8,7 @@
 namespace xrgs {
 namespace XRGS_NS {
 
-// The number of vectors that the registers hold.
+// The number of vectors that fit in the registers.
 constexpr int kVectorRegisters = 32;
 constexpr bool kFusedMultiplyAdd = true;
 
@@ -42,8 +42,8 @@ XRGS_INLINE Floats fma(Floats a, Floats b, Floats c) { return {_mm512_fmadd_ps(a
 XRGS_INLINE Floats fnma(Floats a, Floats b, Floats c) { return {_mm512_fnmadd_ps(a.v, b.v, c.v)}; }
 XRGS_INLINE Floats min(Floats a, Floats b) { return {_mm512_min_ps(a.v, b.v)}; }
 XRGS_INLINE Floats max(Floats a, Floats b) { return {_mm512_max_ps(a.v, b.v)}; }
-// The order of positive floats is that of their bits, and integer comparisons have more execution
-// units.
+// Positive floats have the same order as their bits as integers, and more execution units compare
+// integers.
 XRGS_INLINE Floats min_positive(Floats a, Floats b) {
   return {
       _mm512_castsi512_ps(_mm512_min_epi32(_mm512_castps_si512(a.v), _mm512_castps_si512(b.v)))};
@@ -119,8 +119,8 @@ template <int R>
 XRGS_INLINE Floats broadcast_row(Floats a) {
   return {_mm512_shuffle_f32x4(a.v, a.v, R * 0x55)};
 }
-// The lanes k of p[(16 C + k) / 3], which may read up to p[16], and of p[(16 C + k) % 3], which may
-// read up to p[3]. C is 0 to 2.
+// repeat_thrice has p[(16 C + k) / 3] in lane k, and may read up to p[16]. repeat_triple has
+// p[(16 C + k) % 3] in lane k, and may read up to p[3]. C is 0 to 2.
 template <int C>
 XRGS_INLINE Floats repeat_thrice(const float* p) {
   constexpr int k = 16 * C;

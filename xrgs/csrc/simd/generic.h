@@ -1,5 +1,5 @@
-// Operations of simd.h in terms of the others, for instruction sets that have no better form of
-// them. avx2.h and vector16.h include this file.
+// Operations of simd.h in terms of other operations, for instruction sets without a faster form.
+// avx2.h and vector16.h include this file.
 #pragma once
 
 #include <cstdint>

@@ -1,14 +1,13 @@
 // Vectors of sixteen float lanes: the only vector type of the kernels.
 //
 // A kernel is written once, in terms of the operations below, and compiled once for each
-// instruction set. Each instruction set is one file, which defines the operations that are listed
-// here; a new one is such a file, a line in the #if at the end of this list, and its compiler flags
-// in CMakeLists.txt.
+// instruction set. An instruction set is a file that defines these operations. To add one, add such
+// a file, a line in the #if after this list, and its compiler flags in CMakeLists.txt.
 //
 // The file of an instruction set must define
 //
 //   struct Floats, Ints, Mask           sixteen float32, sixteen int32, sixteen booleans
-//   int kVectorRegisters                number of Floats that the registers hold
+//   int kVectorRegisters                number of Floats that fit in the registers
 //   bool kFusedMultiplyAdd              fma() rounds once
 //
 //   Floats broadcast(float)             the same number in every lane
@@ -58,13 +57,13 @@
 //   Floats broadcast_row<R>(a)          row R, in all four rows
 //   Floats sum_rows(a)                  (row 0 + row 2) + (row 1 + row 3), in all four rows
 //
-// Every instruction set rounds in the same way and adds in the same order, and the compiler fuses
-// nothing of its own accord (-ffp-contract=off): all of them that have a fused multiply-add give
-// the same bits. kFusedMultiplyAdd says whether one has.
+// Every instruction set rounds in the same way and adds in the same order, and the compiler does
+// not fuse operations (-ffp-contract=off). So all instruction sets with a fused multiply-add
+// (kFusedMultiplyAdd) give the same bits.
 //
 // Kernel files must not call inline functions of the standard library unless they are certain to be
-// inlined: the linker keeps one copy of such a function for the whole module, which may be the one
-// that was compiled for a processor other than the one at hand.
+// inlined: the linker keeps one copy of such a function for the whole module, which may use
+// instructions that the processor lacks.
 #pragma once
 
 namespace xrgs {
@@ -85,7 +84,7 @@ constexpr int kLanes = 16;
 #include "simd/vector16.h"
 #endif
 
-// What follows is made of the operations above, the same for every instruction set.
+// The functions below use the operations above, and are the same for every instruction set.
 namespace xrgs {
 namespace XRGS_NS {
 
@@ -116,8 +115,7 @@ XRGS_INLINE void store_quadruples(float* p, Floats w, Floats x, Floats y, Floats
 //
 // 2^x = 2^n 2^f, with n the integer nearest to x: 2^f is a polynomial of degree 6 whose constant is
 // 1, and n is added to its exponent. The polynomial's relative error is 2.0e-9; the rest is
-// rounding. Each step is taken for all `Count` vectors before the next, because each waits for the
-// one before.
+// rounding. Each step is computed for all `Count` vectors before the next step, to hide latency.
 template <int Count>
 XRGS_INLINE void exp2(const Floats (&x)[Count], Floats (&result)[Count]) {
   constexpr float kCoefficients[] = {0.00015353362f, 0.0013398874f, 0.0096184374f, 0.0555033247f,
@@ -141,9 +139,9 @@ XRGS_INLINE Floats exp2(Floats x) {
   return out[0];
 }
 
-// e^x with a relative error below 1.0e-7, and exactly 1 at 0: 0 where e^x is below 2^-126, infinite
-// where it is above the largest float, NaN for NaN. No value lies below the normal numbers, so that
-// the result is the same where the processor flushes those to 0.
+// e^x with a relative error below 1.0e-7, and exactly 1 at 0: 0 if e^x is below 2^-126, infinite if
+// it is above the largest float, NaN for NaN. No intermediate value is denormal, so the result does
+// not depend on whether the processor flushes denormal numbers to 0.
 //
 // e^x = 2^n e^r, with n the integer nearest to x / ln 2 and r = x - n ln 2. ln 2 is subtracted in
 // two parts, the first of which has so few bits that its product with n is exact. e^r is a
@@ -161,25 +159,24 @@ XRGS_INLINE Floats exp(Floats x) {
   p = fma(r, p, broadcast(1.0f));
   p = fma(r, p, broadcast(1.0f));
   const Floats y = as_floats(as_ints(p) + shift_left<23>(as_ints(t)));
-  // Outside of these bounds, the first and last floats whose result is a normal number, n does not
-  // fit the exponent.
+  // Outside these bounds, the first and last floats with a normal result, n overflows the exponent.
   const Floats small = select(x < broadcast(-87.336540f), broadcast(0.0f), y);
   const Floats all = select(broadcast(88.722831f) < x, broadcast(__builtin_inff()), small);
   return select(x == x, all, x);
 }
 
-// 1 / (1 + e^-x): 0 where it is below 2^-126, NaN for NaN.
+// 1 / (1 + e^-x): 0 if it is below 2^-126, NaN for NaN.
 //
-// It is e^-|x| / (1 + e^-|x|) for negative x and 1 / (1 + e^-|x|) for others: nothing overflows,
-// and no value is below the normal numbers, so that it is the same where the processor flushes
-// those to 0.
+// It is computed as e^-|x| / (1 + e^-|x|) for negative x, else as 1 / (1 + e^-|x|). No intermediate
+// value overflows or is denormal, so the result does not depend on whether the processor flushes
+// denormal numbers to 0.
 XRGS_INLINE Floats logistic(Floats x) {
   const Floats one = broadcast(1.0f);
   const Floats e = exp(-abs(x));
   return select(x < broadcast(0.0f), e, one) / (one + e);
 }
 
-// The derivatives of exp and of logistic, times `gradient`, by their value y.
+// The derivatives of exp and logistic, in terms of their value y, times `gradient`.
 XRGS_INLINE Floats exp_gradient(Floats gradient, Floats y) { return gradient * y; }
 XRGS_INLINE Floats logistic_gradient(Floats gradient, Floats y) {
   return gradient * (y * (broadcast(1.0f) - y));
@@ -187,9 +184,9 @@ XRGS_INLINE Floats logistic_gradient(Floats gradient, Floats y) {
 
 // For a >= 0: at least sqrt(max(a, 1e-20)), and at most 0.2% more.
 //
-// The approximate inverse square roots of the instruction sets differ. This one starts from the
-// bits of a, at most 3.5% off, and one step of Newton's method brings it to at most 0.18% below the
-// inverse root, never above, which the last factor outweighs.
+// The approximate inverse square roots of instruction sets differ, so this one starts from the bits
+// of a, with an error of at most 3.5%. After one step of Newton's method it is at most 0.18% below
+// the inverse root, and never above; the last factor compensates for this.
 XRGS_INLINE Floats sqrt_upper_bound(Floats a) {
   a = max(a, broadcast(1e-20f));
   const Floats start = as_floats(broadcast_int(0x5f3759df) - shift_right<1>(as_ints(a)));
@@ -197,8 +194,8 @@ XRGS_INLINE Floats sqrt_upper_bound(Floats a) {
   return a_start * fnma(broadcast(0.5f * 1.0019f) * a_start, start, broadcast(1.5f * 1.0019f));
 }
 
-// The base-2 logarithm of finite x >= 2^-126, with a relative error below 2.1e-7, or 2.4e-7 where
-// fma() rounds twice, and exactly an integer at powers of two.
+// The base-2 logarithm of finite x >= 2^-126, with a relative error below 2.1e-7 (2.4e-7 if fma()
+// rounds twice), and exact at powers of two.
 //
 // log2(x) = n + log2(m), with m in [sqrt(1/2), sqrt(2)). With s = (m - 1) / (m + 1), |s| < 0.172,
 // the series log2(m) = 2/ln 2 (s + s^3/3 + s^5/5 + ...) is cut after s^9. Its relative error is

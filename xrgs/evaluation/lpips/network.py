@@ -16,33 +16,32 @@ if TYPE_CHECKING:
 
     from torch import Tensor
 
-#: The authors' normalisation of an image in -1..1: one mean and one deviation per channel.
+#: The authors' normalisation of an image in -1..1: mean and standard deviation of each channel.
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
-#: Stride and padding of AlexNet's five convolutions. The second and third are preceded by max
-#: pooling.
+#: Stride and padding of AlexNet's five convolutions. Max pooling precedes the second and third.
 _CONVOLUTIONS = ((4, 2), (1, 2), (1, 1), (1, 1), (1, 1))
 _POOLED = frozenset({1, 2})
 _EPS = 1e-10
-#: The shortest side of an image, px, that leaves the last layer at least one pixel.
+#: Least side of an image, px, at which the last layer has a pixel.
 MIN_SIDE = 31
 
 
 def distance(image: Tensor, target: Tensor, weights: Mapping[str, Tensor]) -> Tensor:
-    """Compute how different two images look [zhang2018, equation 1].
+    """Compute the perceptual distance of two images [zhang2018, equation 1].
 
     The rectified features of each layer are normalised to unit length over the channels. Their
-    squared differences are weighted per channel by the learned linear heads, averaged over the
+    squared differences are weighted per channel by the trained linear heads, averaged over the
     pixels, and summed over the layers.
 
     Args:
         image: [H, W, 3] in 0..1.
         target: [H, W, 3] in 0..1.
-        weights: Tensors named as `xrgs.evaluation.lpips.weights.load` names them, in the images'
-            dtype.
+        weights: Name -> tensor, with the names of `xrgs.evaluation.lpips.weights.load`, in the
+            images' dtype.
 
     Returns:
-        A scalar: 0 where the images are identical, larger where they differ more.
+        A scalar, 0 for identical images.
 
     Raises:
         ValueError: A side is shorter than `MIN_SIDE`.
@@ -68,7 +67,10 @@ def _features(x: Tensor, weights: Mapping[str, Tensor]) -> Iterator[Tensor]:
 
 
 def _layer_distance(x: Tensor, head: Tensor) -> Tensor:
-    """Compute one layer's term of the distance from features [2, C, h, w] and a head [C]."""
+    """Compute a layer's term of the distance from both images' features and the head [C].
+
+    The features are [2, C, h, w].
+    """
     unit = x / (x.square().sum(1, keepdim=True).sqrt() + _EPS)
     squared = (unit[0] - unit[1]).square()  # [C, h, w]
     return torch.einsum("chw,c->hw", squared, head).mean()

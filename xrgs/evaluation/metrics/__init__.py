@@ -1,9 +1,9 @@
-"""Every metric: its name, label, unit and direction, in the order of the tables.
+"""All metrics: name, label, unit and direction, in the order of the tables.
 
-To add a score of views, add a file with its function, and an entry to `METRICS`; `xrgs-store
-rescore` then computes it for cells that are done. Any other entry is a figure of the cell's
-summary, or follows from the PSNR of its views (`xrgs.store.results.over_views`). torch and
-kornia are imported where they are used, because plans and reports are made without them.
+To add a score of views, add a file with its function, and an entry to `METRICS`; then `xrgs-store
+rescore` computes it for finished cells. The other entries are values of the cell's summary, or
+are computed from the PSNR of the views (`xrgs.store.results.over_views`). torch and kornia are
+imported inside functions, since plans and reports do not need them.
 """
 
 from __future__ import annotations
@@ -80,20 +80,20 @@ METRICS = (
 
 _SCORES = {metric.name: metric.score for metric in METRICS if metric.score is not None}
 ON_REQUEST = frozenset({"lpips_vgg"})
-"""Scores that are too slow for every evaluation: `xrgs-store rescore --also NAME` adds them."""
+"""Names of scores that are too slow for every evaluation; `xrgs-store rescore --also NAME` computes
+them."""
 
 VIEW_METRICS = {name: score for name, score in _SCORES.items() if name not in ON_REQUEST}
-"""The functions that `score_view` calls for each test view, by metric name."""
+"""Metric name -> function that `score_view` calls for each test view."""
 
 _also: ContextVar[frozenset[str]] = ContextVar("also", default=frozenset())
 
 
 @contextmanager
 def also_scored(names: frozenset[str]) -> Iterator[None]:
-    """Let `score_view` compute scores of `ON_REQUEST` too.
+    """Let `score_view` also compute the scores `names` of `ON_REQUEST`, inside a `with` block.
 
-    It is a context and not an argument of the evaluation protocol, whose code is part of what
-    scores are compared by.
+    An argument would change the code of the evaluation protocol, and so make all scores stale.
     """
     token = _also.set(names)
     try:
@@ -105,17 +105,17 @@ def also_scored(names: frozenset[str]) -> Iterator[None]:
 def score_view(
     image: Tensor, target: Tensor, mask: Tensor | None, *, masked: bool
 ) -> dict[str, float | None]:
-    """Score a render against its photograph by every metric.
+    """Score a render against its photograph with every metric of views.
 
     Args:
         image: The render, [H, W, 3] in 0..1.
         target: The photograph, [H, W, 3] in 0..1.
-        mask: [H, W] bool, True for a pixel that is used; None where the view has no mask.
-        masked: Whether any of the views that are scored together has a mask. A view without one is
-            then scored with a mask of all pixels: a score that one view lacks has no mean.
+        mask: [H, W] bool, True for a used pixel; None if the view has no mask.
+        masked: Whether any of the views of the evaluation has a mask. If so, a view without a mask
+            is scored with a mask of all pixels, so that every view has the same scores.
 
     Returns:
-        Each score by its metric's name; None where it can't be computed or does not apply.
+        Metric name -> score; None if it can't be computed or does not apply.
     """
     if masked and mask is None:
         import torch

@@ -1,4 +1,4 @@
-"""What metrics share: their description, and the comparison inside a mask."""
+"""The description of a metric, and the comparison inside a mask."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ class Metric:
     """A metric: one row of a table."""
 
     name: str
-    """The name of its column in the store."""
+    """Name of the metric's column in the store."""
     label: str
-    """The name shown in tables."""
+    """Name in tables."""
     unit: str
-    """`s`, `ms`, `bytes`, `dB`, or empty for a number without a unit."""
+    """`s`, `ms`, `bytes`, `dB`, or empty for a dimensionless number."""
     higher_is_better: bool
     score: Callable[[Tensor, Tensor, Tensor | None], float | None] | None = None
-    """The function that scores a render and its photograph, both [H, W, 3] in 0..1, inside a mask
-    [H, W] bool, True for a pixel that is used, or None; None for a figure of the whole cell."""
+    """Function of a render and its photograph, both [H, W, 3] in 0..1, and a mask [H, W] bool (True
+    for a used pixel) or None, which returns the score. None for a metric of the whole cell."""
     optional: bool = False
-    """Whether it applies to some views alone. It is a row only of tables in which a cell has it."""
+    """Whether the metric applies only to some views. Tables show it only if a cell has it."""
 
 
 def inside(image: Tensor, target: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Return the image and the target without what is outside the mask.
+    """Replace the pixels of image and target outside the mask by equal colours.
 
-    Both have the colours of the target's nearest used pixels there, so that nothing is compared,
-    and what the mask hides is in no window.
+    Both get the colour of the target's nearest used pixel. So pixels outside the mask do not
+    differ, and no window of a metric contains the hidden ones.
 
     Args:
         image: The render, [H, W, 3].
         target: The photograph, [H, W, 3].
-        mask: [H, W] bool, True for a pixel that is used; None uses all.
+        mask: [H, W] bool, True for a used pixel; None uses all.
 
     Raises:
         ValueError: The shapes differ or are not [H, W, 3].

@@ -15,17 +15,17 @@ def lpips(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | 
     """Compute the perceptual distance LPIPS, version 0.1, with AlexNet (`alex` in gsplat).
 
     Source: [zhang2018] "The unreasonable effectiveness of deep features as a perceptual
-    metric"; see `xrgs.evaluation.lpips.network`. Outside the mask both pictures are the same. The
-    distance is still the mean over the whole picture.
+    metric"; see `xrgs.evaluation.lpips.network`. Outside the mask both images are made equal. The
+    distance is the mean over the whole image.
 
     Args:
         image: The render, [H, W, 3] in 0..1.
         target: The photograph, [H, W, 3] in 0..1.
-        mask: [H, W] bool, True for a pixel that is used; None uses all.
+        mask: [H, W] bool, True for a used pixel; None uses all.
 
     Returns:
-        The distance, 0 where the images are identical; None (n/a in the tables) where this machine
-        has no weights, or a side of the images is too short for the network.
+        The distance, 0 for identical images; None (n/a in the tables) if this machine has no
+        weights, or a side of the images is too short for the network.
 
     Raises:
         ValueError: The shapes differ or are not [H, W, 3].

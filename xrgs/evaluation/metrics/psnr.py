@@ -19,11 +19,11 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | N
     Args:
         image: The render, [H, W, 3] in 0..1.
         target: The photograph, [H, W, 3] in 0..1.
-        mask: [H, W] bool, True for a pixel that is used; None uses all.
+        mask: [H, W] bool, True for a used pixel; None uses all.
 
     Returns:
-        The ratio in dB; infinity where the images are identical, as in scikit-image (tables show
-        no percentage change from or to infinity). None where no pixel is used.
+        The ratio, dB; infinity for identical images, as in scikit-image (tables show no percentage
+        change from or to infinity). None if no pixel is used.
 
     Raises:
         ValueError: The shapes differ or are not [H, W, 3].
@@ -42,5 +42,5 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | N
 
 
 def psnr_plain(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | None:
-    """Compute `psnr` of the whole picture where a mask is given; None where none is."""
+    """Compute `psnr` without the mask; None if there is no mask, since `psnr` is the same then."""
     return None if mask is None else psnr(image, target)

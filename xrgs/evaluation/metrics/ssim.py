@@ -9,18 +9,17 @@ from xrgs.evaluation.metrics.base import inside
 if TYPE_CHECKING:
     from torch import Tensor
 
-#: Width of the window, px. It is part of the evaluation protocol and not taken from the training
-#: loss: another window there must not change what the scores mean.
+#: Side of the window, px. It is separate from that of the training loss, so that a change there
+#: does not change the scores.
 SSIM_WINDOW = 11
 
 
 def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | None:
     """Compute the structural similarity, averaged over channels and used pixels.
 
-    A window across the border of the mask compares equal pixels outside of it.
-
-    It is `kornia.metrics.ssim`: a Gaussian window of 11 x 11 px and sigma 1.5, data range 1,
-    borders reflected. gsplat's evaluation gives the same to the fourth digit.
+    Windows across the border of the mask compare equal pixels outside it. The function is
+    `kornia.metrics.ssim`: a Gaussian window of 11 x 11 px and sigma 1.5 px, data range 1, reflected
+    borders. gsplat's evaluation gives the same to the fourth digit.
 
     Source: [wang2004] "Image quality assessment: from error visibility to structural
     similarity".
@@ -28,13 +27,14 @@ def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | N
     Args:
         image: The render, [H, W, 3] in 0..1.
         target: The photograph, [H, W, 3] in 0..1.
-        mask: [H, W] bool, True for a pixel that is used; None uses all.
+        mask: [H, W] bool, True for a used pixel; None uses all.
 
     Returns:
-        A value in -1..1; 1 where the images are identical. None where no pixel is used.
+        A value in -1..1; 1 for identical images. None if no pixel is used.
 
     Raises:
-        ValueError: The shapes differ, are not [H, W, 3], or a side is too short to be reflected.
+        ValueError: The shapes differ or are not [H, W, 3], or a side is too short for reflected
+            borders.
     """
     from kornia import metrics
 

@@ -1,8 +1,7 @@
-"""The ways to degrade HR views into LR views, by `variant.degradation`.
+"""The degradations that make LR views from HR views, by `variant.degradation`.
 
-A new way is one module of this folder, named after the value of the key, and one line in
-`DEGRADATIONS`. The key of a variant has the code and the settings of the degradation that it uses,
-and not those of the others.
+To add one, add a module to this folder, named after the value of the config's key, and a line to
+`DEGRADATIONS`. A variant's key includes code and settings only of its own degradation.
 """
 
 from __future__ import annotations
@@ -27,15 +26,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Degradation:
-    """One way to make an LR view from an HR view."""
+    """A way to make an LR view from an HR view."""
 
     function: Callable[[ImageArray, VariantConf, np.random.Generator], ImageArray]
-    """Takes an HR view [H, W, 3] in 0..1, its sides multiples of `variant.factor`, and a source of
-    random numbers that depends on the view. Returns the LR view, which need not be clamped."""
+    """Function of an HR view [H, W, 3] in 0..1, with sides that are multiples of `variant.factor`,
+    the variant's config, and a random generator that depends on the view. It returns the LR view,
+    which may exceed 0..1."""
     smaller: bool = False
-    """Whether LR views have `variant.factor` times fewer px a side; else they keep their size."""
+    """Whether LR views are `variant.factor` times smaller; otherwise they keep their size."""
     keys: tuple[str, ...] = ()
-    """The keys of `variant` that no other degradation reads."""
+    """Keys of `variant` that only this degradation reads."""
 
 
 DEGRADATIONS: dict[str, Degradation] = {
@@ -49,10 +49,10 @@ DEGRADATIONS: dict[str, Degradation] = {
 
 
 def resolve_degradation(conf: VariantConf) -> str:
-    """Return a key of `DEGRADATIONS`, or `none`; `auto` depends on how views are tagged.
+    """Return a key of `DEGRADATIONS`, or `none`; resolve `auto` by `variant.tags`.
 
-    Tags by a property of the photographs need no degradation, because the views differ already.
-    Tags drawn at random mean nothing without one.
+    With tags by a property of the photographs, views differ already, and `auto` is `none`. Random
+    tags have no meaning without a degradation.
     """
     if conf.degradation == "auto":
         return "downsample" if conf.tags == "flag" else "none"

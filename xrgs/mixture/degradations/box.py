@@ -1,4 +1,4 @@
-"""Averages a view over the area of each LR pixel, as a sensor without blur does."""
+"""Averages a view over the area of each LR pixel, as a sensor behind an ideal lens."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Takes the detail from a view and keeps its size, as a sensor that upsamples gives it."""
+"""Removes detail from a view and keeps its size, as the digital zoom of a camera."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def digital_zoom(high: ImageArray, conf: VariantConf, _rng: np.random.Generator) -> ImageArray:
-    """Return the view [H, W, 3] after it was downsampled by `factor` and resized back."""
+    """Return the view [H, W, 3] downsampled by `factor` and upsampled to its size."""
     height, width = high.shape[:2]
     small = images.resize(high, width // conf.factor, height // conf.factor)
     return images.resize(small, width, height)

@@ -1,4 +1,4 @@
-"""Downsamples a view: `variant.factor` times fewer pixels per side (paper, section 4.1)."""
+"""Downsamples width and height of a view by `variant.factor` (paper, section 4.1)."""
 
 from __future__ import annotations
 

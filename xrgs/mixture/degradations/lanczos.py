@@ -1,4 +1,4 @@
-"""Downsamples a view by Lanczos's filter, which is sharper than `downsample` and rings."""
+"""Downsamples a view by a Lanczos filter, which is sharper than `downsample`, with ringing."""
 
 from __future__ import annotations
 
@@ -16,6 +16,6 @@ def lanczos(high: ImageArray, conf: VariantConf, _rng: np.random.Generator) -> I
     """Return the view [H / factor, W / factor, 3] by Pillow's antialiased Lanczos-3 filter."""
     height, width = high.shape[:2]
     size = width // conf.factor, height // conf.factor
-    # Pillow filters floats in images of one channel alone.
+    # Pillow filters floats only in images with one channel.
     channels = (Image.fromarray(np.ascontiguousarray(high[..., c])) for c in range(3))
     return np.stack([np.asarray(c.resize(size, Image.Resampling.LANCZOS)) for c in channels], -1)

@@ -1,4 +1,4 @@
-"""Makes LR views as a phone makes photographs: blurred, averaged by pixels, noisy, compressed."""
+"""Makes LR views similar to photographs of a phone: blur, pixel averages, noise, compression."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ if TYPE_CHECKING:
 def phone(high: ImageArray, conf: VariantConf, rng: np.random.Generator) -> ImageArray:
     """Return the LR view [H / factor, W / factor, 3].
 
-    Its steps, all on sRGB values:
+    Steps, all on sRGB values:
 
-    1. a Gaussian blur of `phone.blur` LR px, for lens, focus and motion;
+    1. a Gaussian blur with a sigma of `phone.blur` LR px, for lens, focus and motion;
     2. the mean over the area of an LR pixel;
-    3. noise of a normal distribution, `phone.noise` steps of 8 bits, in each channel on its own;
+    3. normal noise with a sigma of `phone.noise` 8-bit steps, independent in each channel;
     4. JPEG with halved chroma (4:2:0) at `phone.jpeg_quality`.
 
-    Our choice: a test that the kernel which training knows is not the one that made the views. A
-    raw converter sharpens and removes noise too; both are left out.
+    Our choice, to test views that were not made by the kernel that training assumes. The sharpening
+    and denoising of a raw converter are left out.
     """
-    from scipy import ndimage  # not at the top: plans import this module, and blur nothing
+    from scipy import ndimage  # plans import this module without calling it
 
     phone = conf.phone
     sigma = phone.blur * conf.factor  # HR px

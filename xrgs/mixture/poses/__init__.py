@@ -1,9 +1,9 @@
-"""Takes cameras and points from files of the user's in place of a new SfM: `variant.poses`.
+"""Reads cameras and points from the user's files instead of running SfM: `variant.poses`.
 
-A model of COLMAP is read, or a transforms.json. A pose belongs to the photograph whose path ends
-with the same folders and name, whatever the suffix.
+The files are a COLMAP model or a transforms.json. A pose belongs to the photograph whose path ends
+with the same folders and name; suffixes are ignored.
 
-Nothing here imports pycolmap before cameras are read.
+pycolmap is imported only to read cameras.
 """
 
 from __future__ import annotations
@@ -38,20 +38,18 @@ if TYPE_CHECKING:
     from xrgs.mixture.sfm import Reconstruction
     from xrgs.photos.scenes import Scene
 
-#: The clockwise quarters that EXIF's orientation turns stored pixels by; the others mirror them.
+#: EXIF orientation -> clockwise quarter turns of the stored pixels; other orientations mirror.
 _QUARTERS = {1: 0, 3: 2, 6: 1, 8: 3}
-#: A photograph of which undistortion keeps less is named.
+#: Fraction of a photograph's pixels; if undistortion keeps fewer, a note names the photograph.
 _LEAST_KEPT = 0.9
 
 
 def fingerprint(path: str) -> str:
-    """Hash the files that poses are read from: 64 hexadecimal digits of a SHA-256.
-
-    It does not depend on where the files are.
+    """Hash the files of the poses, independent of their folder: 64 hexadecimal digits of a SHA-256.
 
     Raises:
-        UnreadableError: A file can't be read now.
-        XrgsError: Files are missing, or their layout is not one of the two.
+        UnreadableError: A file can't be read at the moment.
+        XrgsError: Files are missing, or have neither of the two layouts.
     """
     sha256 = hashlib.sha256()
     with _errors_named(path):
@@ -64,7 +62,7 @@ def fingerprint(path: str) -> str:
 
 @contextmanager
 def _errors_named(path: str) -> Iterator[None]:
-    """Begin each error with the key; an error of a file may be transient."""
+    """Prefix each error with the config's key; raise `UnreadableError` for transient errors."""
     try:
         yield
     except OSError as error:
@@ -77,7 +75,7 @@ def _errors_named(path: str) -> Iterator[None]:
 
 
 def _source(path: str) -> Path | list[Path]:
-    """Return the folder of COLMAP's models, or the transforms.json, or its parts."""
+    """Return the folder of COLMAP models, or the list of transforms.json files."""
     root = user_path(path)
     if not root.exists():
         raise XrgsError("no such folder or file")
@@ -96,10 +94,10 @@ def _source(path: str) -> Path | list[Path]:
 
 
 def with_masks(scene: Scene, path: str | None) -> Scene:
-    """Return a scene with the masks that `variant.poses` names, where it has no masks itself.
+    """Add the masks of `variant.poses` to a scene without masks.
 
     Raises:
-        As `read_poses`.
+        As for `read_poses`.
     """
     if path is None:
         return scene
@@ -118,12 +116,12 @@ def with_masks(scene: Scene, path: str | None) -> Scene:
 
 
 def read_poses(path: str, photos: PhotoCollection) -> Reconstruction:
-    """Read the cameras of the HR views of photographs, and all points, from `variant.poses`.
+    """Read the cameras of the HR views, and all points, from `variant.poses`.
 
     Raises:
-        UnreadableError: A file can't be read now.
+        UnreadableError: A file can't be read at the moment.
         XrgsError: The files are malformed, a camera model is not supported, no photograph has the
-            name of an image, or there are too few points. No points at all are no error.
+            name of an image, or there are too few points (but none at all are accepted).
     """
     from xrgs.mixture.sfm import Reconstruction
 
@@ -136,7 +134,7 @@ def read_poses(path: str, photos: PhotoCollection) -> Reconstruction:
             given = transforms.read(source)
             names = listed([file.name for file in source])
             in_folder = [f"variant.poses: {names} is read"] if user_path(path).is_dir() else []
-        with np.errstate(over="ignore"):  # training is in 32 bits
+        with np.errstate(over="ignore"):  # training uses float32
             usable = np.isfinite(given.points.astype(np.float32)).all(axis=1)
         points = given.points[usable]
         if len(given.points) and len(points) < max(MIN_POINTS, len(given.points)):
@@ -182,7 +180,11 @@ def _moved_points(
     viewmats: Mapping[int, NDArray[np.float64]],
     to: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], list[str]]:
-    """Move points to the world of the cameras; drop those that are rounded too much, and say so."""
+    """Move points to the world of the cameras; if they are rounded too coarsely, drop all of them.
+
+    Returns:
+        The points, and a note if they were dropped.
+    """
     own, notes = world.moved_points(points, to), []
     if step := world.rounding(points, own):
         far = float(np.abs(points).max())
@@ -197,17 +199,17 @@ def _moved_points(
 
 
 def _stored(photo: Photograph) -> tuple[int, int]:
-    """Return the width and height that a photograph is stored with, before EXIF turns it."""
+    """Return the stored width and height of a photograph, before applying the EXIF orientation."""
     return images.turned_size(photo.size, photo.orientation)
 
 
 def _turned_by_exif(lenses: Mapping[int, Lens], photos: PhotoCollection) -> set[int]:
-    """Return the photographs that EXIF turns away from the pixels of their cameras.
+    """Return the indices of photographs whose cameras need the EXIF rotation.
 
-    COLMAP, nerfstudio and instant-ngp take pixels as they are stored, but may have got copies that
-    were upright already. A camera that has the shape of one alone decides for itself, and for those
-    that fit both ways: of square photographs, and of ones that EXIF turns by 180 degrees. Where all
-    fit both ways, the pixels are taken to be as stored.
+    COLMAP, nerfstudio and instant-ngp ignore EXIF and use the stored pixels, but the user may have
+    given them upright copies. The shape of a camera shows which, unless the photograph is square or
+    EXIF turns it by 180 degrees. Such cameras are treated as the others; if all are such cameras,
+    the pixels are assumed to be as stored.
     """
     stored, upright, either = set[int](), set[int](), set[int]()
     for i, lens in lenses.items():
@@ -222,7 +224,7 @@ def _turned_by_exif(lenses: Mapping[int, Lens], photos: PhotoCollection) -> set[
 def _upright(
     lens: Lens, viewmat: NDArray[np.float64], photo: Photograph
 ) -> tuple[Lens, NDArray[np.float64]]:
-    """Turn a camera and its pose as EXIF turns the photograph."""
+    """Apply the EXIF rotation of a photograph to its camera and pose."""
     quarters = _QUARTERS.get(photo.orientation)
     if quarters is None:
         raise XrgsError(
@@ -262,20 +264,21 @@ def _notes(
 
 
 def match_names(poses: Sequence[str], photographs: Sequence[tuple[str, Path]]) -> dict[str, int]:
-    """Find the photograph of each pose, by the end of its path.
+    """Find the photograph of each pose by comparing the ends of their paths.
 
     Args:
         poses: The names of images in a file of poses, with folders and suffix.
         photographs: The name and the file of each photograph.
 
     Returns:
-        The index of the photograph by the name of the pose. Of several poses that fit a photograph,
-        the one that shares most folders with it has it; poses that fit several are left out.
+        Name of a pose -> index of its photograph. If several poses match a photograph, it gets the
+        pose that shares the most folders with it. Poses that match several photographs are left
+        out.
 
     Raises:
-        XrgsError: No pose has a photograph, or two poses fit one photograph alike.
+        XrgsError: No pose matches a photograph, or two poses match a photograph equally well.
     """
-    ends: dict[str, set[int]] = {}  # the photographs by how their paths may end
+    ends: dict[str, set[int]] = {}  # end of a path -> its photographs
     for i, (name, file) in enumerate(photographs):
         for end in (name, file.stem):
             ends.setdefault(end, set()).add(i)
@@ -307,17 +310,17 @@ def match_names(poses: Sequence[str], photographs: Sequence[tuple[str, Path]]) -
 
 
 def _parts(path: str) -> tuple[str, ...]:
-    """Return the folders and the name, without suffix, of a path of any system."""
+    """Return folders and name, without suffix, of a path from any operating system."""
     pure = PurePosixPath(path.replace("\\", "/"))
-    # Blender and other programs leave the suffix out: the end of frame.0001 is none.
+    # Blender and other programs omit the suffix: .0001 of frame.0001 is not a suffix.
     return pure.parts if pure.suffix[1:].isdigit() or not pure.name else pure.with_suffix("").parts
 
 
 def _shared(pose: Sequence[str], name: str, file: Path) -> int:
-    """Return how many parts at its end the path of a pose shares with a photograph.
+    """Return the number of parts at the end of a pose's path that agree with the photograph.
 
-    The folders below `scene.path` are in the name of a photograph: the view of rig1/0004.jpg is
-    rig1_0004. They must agree as far as the pose has folders.
+    The name of a photograph includes its folders below `scene.path`: the view of rig1/0004.jpg is
+    rig1_0004. If the pose has folders, these must agree.
     """
     own = file.with_suffix("").parts
     shared = 0

@@ -1,4 +1,4 @@
-"""Refuses given cameras that can't be, and names those of other pictures than the photographs."""
+"""Refuses impossible cameras, and reports cameras that do not belong to the photographs."""
 
 from __future__ import annotations
 
@@ -19,36 +19,36 @@ if TYPE_CHECKING:
     from xrgs.mixture.photographs import PhotoCollection, Photograph
     from xrgs.photos.lens import Lens
 
-#: The largest difference of the aspect ratios of an image and its photograph, which rounding of
-#: their sides to whole px explains.
+#: Largest relative difference of aspect ratios that rounding sides to whole px explains.
 _MAX_ASPECT = 0.01
-#: The focal length over the longer side, from 157 degrees (COLMAP's own limit) to half a degree.
+#: Range of the focal length over the longer side: a field of view of 157 degrees (COLMAP's limit)
+#: to half a degree.
 _FOCAL_RANGE = (0.1, 100.0)
-#: The most that pixels are longer one way than the other; anamorphic lenses have 2.
+#: Largest ratio of the focal lengths of both axes; anamorphic lenses have 2.
 _MAX_PIXEL_ASPECT = 3.0
-#: How many times as many px a side a picture has as its smaller copy, at most.
+#: Largest ratio of the sides of a picture and of its smaller copy.
 _MOST_SMALLER = 16
-#: Cameras that are closer together than this share of the distance of their points see no depth:
-#: points move by a tenth of a pixel from one to the other. Our choice.
+#: Least extent of the cameras over the distance of their points. Below it, points move by less than
+#: about a tenth of a pixel between cameras, so that depths are unknown. Our choice.
 _LEAST_BASELINE = 1e-4
-#: Differences of large numbers in 64 bits that are only rounded.
+#: Relative rounding error of differences of large float64 numbers.
 _ROUNDING = 1e-14
 
 
 def same_shape(a: tuple[int, int], b: tuple[int, int]) -> bool:
-    """Return whether two sizes have one aspect ratio."""
+    """Return whether two sizes have the same aspect ratio."""
     return abs(a[0] * b[1] / (a[1] * b[0]) - 1) <= _MAX_ASPECT
 
 
 def check_camera(lens: Lens, photo: Photograph) -> None:
-    """Refuse the camera of another picture, and a camera that can't be.
+    """Refuse the camera of another picture, and an impossible camera.
 
     Args:
-        lens: The camera of the upright photograph, at the size that the file of poses has.
+        lens: The camera of the upright photograph, at the size in the file of poses.
         photo: The photograph.
 
     Raises:
-        XrgsError: The shapes differ, or the focal length or the principal point can't be.
+        XrgsError: The aspect ratios differ, or the focal length or principal point is impossible.
     """
     size = lens.width, lens.height
     if not same_shape(size, photo.size):
@@ -71,15 +71,16 @@ def check_camera(lens: Lens, photo: Photograph) -> None:
 
 
 def check_places(centres: NDArray[np.float64], points: NDArray[np.float64], far: float) -> None:
-    """Refuse cameras that are all at one place, from which nothing has a depth.
+    """Refuse cameras that are all at the same place, from which depths can't be measured.
 
     Args:
-        centres: The cameras [N, 3], their mean at the origin.
-        points: The points [P, 3] around the same origin; there may be none.
-        far: How far this origin is from that of the given world, whose numbers are rounded.
+        centres: The cameras' centres [N, 3], with the mean at the origin, world units.
+        points: The points [P, 3], with the same origin; there may be none.
+        far: Distance of this origin from the origin of the given world, for its rounding errors,
+            world units.
 
     Raises:
-        XrgsError: They are.
+        XrgsError: All cameras are at the same place.
     """
     extent = np.linalg.norm(centres, axis=1).max()
     distance = float(np.median(np.linalg.norm(points, axis=1))) if len(points) else 0.0
@@ -93,18 +94,19 @@ def check_places(centres: NDArray[np.float64], points: NDArray[np.float64], far:
 def of_other_pictures(
     lenses: Mapping[int, Lens], names: Mapping[int, str], photos: PhotoCollection, source: Path
 ) -> list[str]:
-    """Say which cameras are of pictures that are neither the photographs nor smaller copies.
+    """Return a note on cameras of pictures that are neither the photographs nor smaller copies.
 
-    These may be the images that COLMAP undistorted, whose sides differ by a few px.
+    Such pictures may be those that COLMAP undistorted, whose sides differ by a few px.
 
     Args:
-        lenses: The cameras of upright photographs by index, at the sizes that the poses have.
-        names: The names that the images have in the poses.
+        lenses: Index of an upright photograph -> its camera, at the size in the file of poses.
+        names: Index of a photograph -> name of its image in the poses.
         photos: The photographs.
         source: The file or folder of the poses.
 
     Raises:
-        XrgsError: The pictures are beside the poses, at exactly the cameras' sizes.
+        XrgsError: Pictures with exactly the cameras' sizes are in a folder next to the poses; the
+            message names it.
     """
     odd = [i for i, of in lenses.items() if not _is_copy((of.width, of.height), photos[i].size)]
     for i in odd:
@@ -137,7 +139,7 @@ def _size(file: Path) -> tuple[int, int] | None:
 
 
 def _is_copy(size: tuple[int, int], photograph: tuple[int, int]) -> bool:
-    """Return whether a size is a photograph's, or one of the two is a whole number smaller."""
+    """Return whether two sizes are equal, or differ by a whole factor."""
     if size == photograph:
         return True
     small, large = sorted((size, photograph))

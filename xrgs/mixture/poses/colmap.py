@@ -1,8 +1,8 @@
-"""Reads models of COLMAP, binary and text, of any version.
+"""Reads COLMAP models, binary and text, of any version.
 
-pycolmap's reader is not used: it takes memory for whatever a file declares, accepts files that were
-cut, and ends names at a space. COLMAP writes the pose of every image into `images`, also where it
-comes from a rig, so that `rigs` and `frames` are not needed.
+pycolmap's reader is not used: it allocates any amount of memory that a file declares, accepts
+truncated files, and ends names at a space. `rigs` and `frames` are not needed, since COLMAP writes
+the pose of every image into `images`, also for rigs.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from xrgs.runtime.text import listed
 from xrgs.safeio.files import list_names
 from xrgs.safeio.records import read_file
 
-#: The files of a model, whose names some programs begin with that of the project.
+#: Names of a model's files; some programs add the project's name as a prefix.
 _NAME = re.compile(r"(.*?)(cameras|images|points3d)\.(bin|txt|ply)", re.IGNORECASE)
-#: The largest file that is read, in bytes: a model of ten thousand images has a few GB.
+#: Size limit of a file, bytes: a model of ten thousand images has a few GB.
 _MAX_BYTES = 1 << 34
-#: The number of a point that an image's feature does not belong to: -1 of an unsigned integer.
+#: Point id of a feature without a point: -1 as an unsigned integer.
 _NO_POINT = np.uint64(2**64 - 1)
 _FEATURE = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<u8")])
-#: A track's element: the numbers of an image and of its feature.
+#: Size of a track's element, the ids of an image and of its feature, bytes.
 _TRACK_BYTES = 8
 
 
@@ -51,7 +51,7 @@ class _Image:
     translation: Sequence[float]
     camera: int
     features: NDArray[np.void]
-    """Its features that have a point, of `_FEATURE`; px."""
+    """The image's features with a point, of type `_FEATURE`, px."""
 
 
 @dataclass(frozen=True)
@@ -62,10 +62,10 @@ class _Points:
 
 
 def files(root: Path) -> list[Path]:
-    """Return the files of the model in or below a folder: of several, the one of most images.
+    """Return the files of the model in or below a folder; of several models, the largest one.
 
     Returns:
-        cameras, images and points3D, which may be missing; nothing where there is no model.
+        The paths of cameras, images and, if it exists, points3D; empty if there is no model.
 
     Raises:
         OSError: A folder can't be read.
@@ -79,7 +79,7 @@ def read(root: Path) -> GivenPoses:
     """Read the model in or below a folder.
 
     Raises:
-        UnreadableError: A file can't be read now.
+        UnreadableError: A file can't be read at the moment.
         XrgsError: A file is malformed; the message names it.
     """
     models = _models(root)
@@ -127,11 +127,12 @@ def _errors(
     numbers: NDArray[np.uint64],
     xyz: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Project the points that an image observes; the errors that a model stores may be outdated.
+    """Compute the reprojection errors of an image, since errors stored in a model may be outdated.
 
     Returns:
-        The place of each point and its distance from its feature in px [N, 2]: infinite behind the
-        camera and outside of its model. Nothing for an image whose camera can't be read.
+        [N, 2] index of each observed point, and the distance of its projection from the feature,
+        px: infinite behind the camera and outside the camera model. Empty if the camera can't be
+        read.
     """
     try:
         lens, viewmat = camera(image.name, (0, 0))
@@ -149,7 +150,7 @@ def _errors(
 
 
 def _report(errors: NDArray[np.float64], notes: list[str]) -> tuple[dict[str, float], list[str]]:
-    """Average errors [N, 2] for each point, and then over the points, as COLMAP does."""
+    """Average errors [N, 2] for each point, then over the points, as COLMAP does."""
     seen = errors[np.isfinite(errors[:, 1])]
     if behind := len(errors) - len(seen):
         notes.append(
@@ -165,7 +166,7 @@ def _report(errors: NDArray[np.float64], notes: list[str]) -> tuple[dict[str, fl
 
 
 def _points(file: Path | None = None) -> _Points:
-    """Read the points of a model; those of a .ply have no number, and are in no image."""
+    """Read the points of a model; points of a .ply have no ids and no observations."""
     from xrgs.mixture.colmap import read_points
 
     if file is not None and file.suffix == ".bin":
@@ -189,7 +190,7 @@ def _notes(root: Path, models: Sequence[Sequence[Path]]) -> list[str]:
 
 
 def _models(root: Path) -> list[list[Path]]:
-    """Return the files of the models in or else below a folder, the one of most images first."""
+    """Return the files of each model in a folder, else below it; the model of most images first."""
     below = (root, root / "sparse")
     folders = [f / name for f in below if f.is_dir() for name in list_names(f)]
     found = [
@@ -200,10 +201,10 @@ def _models(root: Path) -> list[list[Path]]:
 
 
 def _complete(folder: Path) -> list[Path] | None:
-    """Return cameras, images and, where there are any, points of the model in a folder.
+    """Return the paths of cameras, images and, if they exist, points of the model in a folder.
 
-    Points may be in a .ply, where the model has none. Of several models, one with points is taken,
-    and of these one whose names have no beginning of their own, or the first.
+    If the model has no points3D, a .ply is taken for it. Of several models, those with points have
+    precedence, then those with names without a prefix, then the first.
     """
     found: dict[tuple[str, str, str], Path] = {}
     for name in list_names(folder):
@@ -211,7 +212,7 @@ def _complete(folder: Path) -> list[Path] | None:
             start, part, suffix = match.groups()
             found[start, part.lower(), suffix.lower()] = folder / name
     models = []
-    for suffix in ("bin", "txt"):  # COLMAP prefers the binary files, too
+    for suffix in ("bin", "txt"):  # binary first, as COLMAP does
         for start in sorted({start for start, _, _ in found}):
             files = [found.get((start, part, suffix)) for part in ("cameras", "images")]
             points = found.get((start, "points3d", suffix)) or found.get((start, "points3d", "ply"))
@@ -229,9 +230,9 @@ def _count_images(file: Path) -> int:
 def _indices(
     points: NDArray[np.uint64], numbers: NDArray[np.uint64]
 ) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Return the places in sorted numbers of the points that are there, and which are there.
+    """Return the indices of point ids `points` in sorted ids `numbers`, and which ids exist.
 
-    A model that was thinned lacks some.
+    In a thinned model some points of features are missing.
     """
     places = np.searchsorted(numbers, points)
     there = places < len(numbers)
@@ -246,7 +247,7 @@ def _viewmat(image: _Image) -> NDArray[np.float64]:
         raise XrgsError("its pose must have finite numbers")
     if not any(image.quaternion):
         raise XrgsError("its quaternion must not be 0; run COLMAP again, or remove the image")
-    # Rotation takes a quaternion of any length that can be computed.
+    # Divided, so that the squares in the length neither overflow nor underflow.
     w, *xyz = np.array(image.quaternion) / np.abs(image.quaternion).max()
     matrix = np.eye(4)
     matrix[:3, :3] = Rotation.from_quat([*xyz, w]).as_matrix()
@@ -258,29 +259,29 @@ def _viewmat(image: _Image) -> NDArray[np.float64]:
 
 
 class _Binary:
-    """Takes values from a binary file of COLMAP, little endian, from its beginning to its end."""
+    """Reads a binary COLMAP file, little endian, from beginning to end."""
 
     def __init__(self, file: Path) -> None:
         self._file, self._data, self._at = file, read_file(file, _MAX_BYTES), 0
 
     def values(self, layout: str) -> tuple[float, ...]:
-        """Take values of a layout of `struct`."""
+        """Read values with a format of `struct`."""
         layout = f"<{layout}"
         return struct.unpack_from(layout, self._data, self._advance(struct.calcsize(layout)))
 
     def number(self, layout: str) -> int:
-        """Take one integer."""
+        """Read an integer with a format of `struct`."""
         return int(self.values(layout)[0])
 
     def count(self, least: int) -> int:
-        """Take the number of the entries that follow, of at least so many bytes each."""
+        """Read the number of the following entries, each of at least `least` bytes."""
         count = self.number("Q")
         if count * least > len(self._data) - self._at:
             raise self._cut(f"{count} entries")
         return count
 
     def text(self) -> str:
-        """Take a text that ends with a zero."""
+        """Read a zero-terminated text."""
         end = self._data.find(b"\0", self._at)
         if end < 0:
             raise self._cut("a name")
@@ -289,7 +290,7 @@ class _Binary:
         return content.decode("utf-8", errors="replace")
 
     def features(self) -> NDArray[np.void]:
-        """Take the features of an image, and return those that have a point."""
+        """Read the features of an image, and return those with a point."""
         count = self.count(_FEATURE.itemsize)
         start = self._advance(count * _FEATURE.itemsize)
         features: NDArray[np.void] = np.frombuffer(self._data, _FEATURE, count, start)
@@ -297,11 +298,11 @@ class _Binary:
         return of_points
 
     def skip(self, size: int) -> None:
-        """Pass over bytes."""
+        """Skip `size` bytes."""
         self._advance(size)
 
     def end(self) -> None:
-        """Check that nothing is left."""
+        """Check that no bytes are left."""
         if left := len(self._data) - self._at:
             raise XrgsError(f"{self._file}: {left} bytes are left after its last entry")
 
@@ -369,7 +370,7 @@ def _text_cameras(file: Path) -> dict[int, _Camera]:
 
 
 def _text_images(file: Path) -> Iterator[_Image]:
-    """Read the two lines of each image; the second one is empty where it has no features."""
+    """Read the two lines of each image; the second line, its features, may be empty."""
     lines = _lines(file)
     for number, line in lines:
         if not line:
@@ -409,7 +410,7 @@ def _text_points(file: Path) -> _Points:
 
 
 def _lines(file: Path) -> Iterator[tuple[int, str]]:
-    """Yield the lines of a text file with their numbers from 1, without comments."""
+    """Yield line number, from 1, and line of a text file, without comments."""
     content = read_file(file, _MAX_BYTES).decode("utf-8", errors="replace")
     for number, line in enumerate(content.split("\n"), 1):
         if not line.startswith("#"):
@@ -418,7 +419,7 @@ def _lines(file: Path) -> Iterator[tuple[int, str]]:
 
 @contextmanager
 def _line(file: Path, number: int, form: str) -> Iterator[None]:
-    """Name the line that can't be read, and what it must have."""
+    """Add the line's number and its expected form to errors."""
     try:
         yield
     except (ValueError, OverflowError) as error:

@@ -1,4 +1,4 @@
-"""What every format of poses is read into."""
+"""The result of reading poses, for all formats."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ from numpy.typing import NDArray
 
 from xrgs.photos.lens import Lens
 
-#: The fewest points: a Gaussian's first size is the distance of a point to its three nearest.
+#: Least number of points, since the initial scale of a Gaussian needs its three nearest points.
 MIN_POINTS = 4
-#: (the name of an image, width and height in px that its photograph is stored with) -> its camera,
-#: in px of the image, and its pose, world to camera [4, 4] with OpenCV axes.
+#: Function: name of an image, stored width and height of its photograph (px) -> the image's camera
+#: (px of the image) and pose (world to camera [4, 4], OpenCV axes).
 CameraOf = Callable[[str, tuple[int, int]], tuple[Lens, NDArray[np.float64]]]
 
 
 @dataclass(frozen=True)
 class GivenPoses:
-    """The cameras and points of a file of the user's."""
+    """The cameras and points of a user's file."""
 
     names: Sequence[str]
-    """The images that have a pose, with folders and suffix as the file has them."""
+    """Names of the images with a pose, with folders and suffix as in the file."""
     camera: CameraOf
-    """Reads one camera; it raises XrgsError where that one is malformed."""
+    """Reads one camera; raises XrgsError if it is malformed."""
     points: NDArray[np.float64]
-    """Points [P, 3]; none where the file has none."""
+    """Points [P, 3]; P may be 0."""
     colors: NDArray[np.uint8]
-    """Their colours [P, 3]."""
+    """Colours of the points [P, 3]."""
     observed: Mapping[str, NDArray[np.intp]] = field(default_factory=dict)
-    """Indices of the points that were found in each image, ascending, where they are known."""
+    """Image name -> ascending indices of its observed points, if known."""
     report: Mapping[str, Any] = field(default_factory=dict)
-    """What the variant's report has beside the notes."""
+    """Entries for the variant's report, besides the notes."""
     notes: Sequence[str] = ()
-    """Sentences on what was taken, left out or not read."""
+    """Sentences on data that was chosen, left out or ignored."""

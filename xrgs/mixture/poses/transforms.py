@@ -19,27 +19,27 @@ from xrgs.runtime.text import listed
 from xrgs.safeio.files import is_inside, list_names
 from xrgs.safeio.records import as_number, read_struct
 
-#: The files of a folder: one has all images, or one has those of each split, as Blender's.
+#: Names in a folder: a file with all images, or one for each split, as in Blender's scenes.
 _WHOLE, _NAME = "transforms.json", re.compile(r"transforms(_\w+)?\.json")
-#: The largest file that is read, in bytes: a thousand views take one MB.
+#: Size limit of a file, bytes: a thousand views take about 1 MB.
 _MAX_BYTES = 1 << 26
-#: From camera axes of OpenGL (x right, y up, z backwards) to OpenCV's, and back.
+#: Converts camera axes between OpenGL (x right, y up, z backwards) and OpenCV.
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-#: How far the columns of a rotation may be from orthogonal and equally long, for rounded digits.
+#: Tolerance of a rotation for rounded digits: 1 minus the ratio of its singular values.
 _MAX_SKEW = 0.01
-#: How far the last row of a matrix may be from 0, 0, 0, 1.
+#: Tolerance of a matrix's last row, 0, 0, 0, 1.
 _MAX_LAST_ROW = 1e-6
-#: The keys that give a focal length; a frame that has one has none of the whole file.
+#: Keys of a focal length. If a frame has one of them, those of the file are ignored.
 _FOCAL = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov")
-#: Names of models that OpenCV's terms describe, whichever of them the file has.
+#: Camera models that are read as OpenCV's, with any of its distortion terms.
 _OPENCV = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 _TERM = re.compile(r"(k|p|s|sx|sy)\d+|k|omega|alpha|beta")
-#: Keys of a camera that is not served, where they are neither 0, false nor empty.
+#: Keys of unsupported cameras, if their value is not 0, false or empty.
 _NOT_SERVED = re.compile(
     r"ftheta_\w+|latlong|equirectangular|rolling_shutter|from_mitsuba|distortion_params"
 )
-#: Keys that are read, and keys that change neither a camera nor the points beside it: the scale and
-#: the place of the whole scene, which poses and points share, and how sharp a picture is.
+#: Keys that are read, and keys that may be ignored silently: scale and position of the whole scene,
+#: which poses and points share, and the sharpness of a picture.
 _KNOWN = {
     *("file_path", "transform_matrix", "ply_file_path", "camera_model", "is_fisheye"),
     *("w", "h", "cx", "cy", *_FOCAL, "applied_transform", "applied_scale", "aabb_scale"),
@@ -48,16 +48,16 @@ _KNOWN = {
 
 
 def in_folder(folder: Path) -> list[Path]:
-    """Return the transforms.json of a folder, or else its parts, as transforms_train.json."""
+    """Return the transforms.json of a folder, else the files of splits (transforms_train.json)."""
     names = [name for name in list_names(folder) if _NAME.fullmatch(name)]
     return [folder / name for name in names if name == _WHOLE or _WHOLE not in names]
 
 
 def files(parts: Sequence[Path]) -> list[Path]:
-    """Return the files that are read: of transforms.json or its parts, and what these name.
+    """Return all files to read: the transforms.json files, and the points and masks they name.
 
     Raises:
-        UnreadableError: A file can't be read now.
+        UnreadableError: A file can't be read at the moment.
         XrgsError: A file is malformed.
     """
     contents = _contents(parts)
@@ -65,19 +65,19 @@ def files(parts: Sequence[Path]) -> list[Path]:
 
 
 def masks(parts: Sequence[Path]) -> dict[str, Path]:
-    """Return the mask of each image that has one in `mask_path`, by the name of the image.
+    """Return image name -> mask, of the images with a `mask_path`.
 
     Raises:
-        As `files`.
+        As for `files`.
     """
     return _masks(_frames(_contents(parts)))
 
 
 def read(parts: Sequence[Path]) -> GivenPoses:
-    """Read a transforms.json, or its parts, and its points.
+    """Read the transforms.json, or the files of its splits, and the points.
 
     Raises:
-        UnreadableError: A file can't be read now.
+        UnreadableError: A file can't be read at the moment.
         XrgsError: A file is malformed; the message names it.
     """
     from xrgs.mixture import colmap
@@ -102,9 +102,9 @@ def read(parts: Sequence[Path]) -> GivenPoses:
 
 
 def _frames(contents: Mapping[Path, dict[str, Any]]) -> dict[str, tuple[Path, dict[str, Any]]]:
-    """Return for each image the file that it is in, and its values.
+    """Return image name -> its transforms.json, and its values.
 
-    Where a frame lacks a value, it has that of its file.
+    Values that a frame lacks are those of the file.
     """
     frames: dict[str, tuple[Path, dict[str, Any]]] = {}
     for file, content in contents.items():
@@ -144,7 +144,7 @@ def _content(file: Path) -> dict[str, Any]:
 
 
 def _points_files(contents: Mapping[Path, Mapping[str, Any]]) -> list[Path]:
-    """Return the .ply files of points that the parts name; the first of them is read."""
+    """Return the .ply files that the transforms.json files name; only the first is read."""
     named = [(file, content.get("ply_file_path")) for file, content in contents.items()]
     return [_below(file, "ply_file_path", name) for file, name in named if name is not None]
 
@@ -158,7 +158,7 @@ def _masks(frames: Mapping[str, tuple[Path, Mapping[str, Any]]]) -> dict[str, Pa
 
 
 def _below(file: Path, key: str, name: object) -> Path:
-    """Return a file that a transforms.json names, which must lie in or below its folder."""
+    """Return the path of a file that a transforms.json names; it must be below its folder."""
     inside = str(PurePosixPath(name)) if isinstance(name, str) else ""
     if not is_inside(inside):
         raise XrgsError(f"{file}: {key} must be a path below the folder of this file")
@@ -168,7 +168,7 @@ def _below(file: Path, key: str, name: object) -> Path:
 def _notes(
     parts: Sequence[Path], frames: Mapping[str, tuple[Path, Mapping[str, Any]]]
 ) -> list[str]:
-    """Name the keys that are not read, and say whose size is taken."""
+    """Return notes on ignored keys and on a missing image size."""
     entries = [entry for _, entry in frames.values()]
     keys = dict.fromkeys(key for entry in entries for key in entry)
     files, notes = listed([file.name for file in parts]), []
@@ -186,7 +186,7 @@ def _lens(entry: Mapping[str, Any], stored: tuple[int, int]) -> Lens:
 
     Args:
         entry: The values of the frame.
-        stored: Width and height that the photograph is stored with, px, where the frame has none.
+        stored: Stored width and height of the photograph, px, if the frame has no size.
     """
     if others := [key for key in entry if _NOT_SERVED.fullmatch(key) and np.any(entry[key])]:
         raise XrgsError(f"{others[0]} is not served: undistort the images, or use another camera")
@@ -203,7 +203,7 @@ def _lens(entry: Mapping[str, Any], stored: tuple[int, int]) -> Lens:
         for key, side in zip(("cx", "cy"), size, strict=True)
     }
     names = MODELS.get(model, ())
-    if "k" in names:  # the name of the only radial term
+    if "k" in names:  # COLMAP's name if there is only one radial term
         values.setdefault("k", values.pop("k1", 0.0))
     unserved = [key for key in values if _TERM.fullmatch(key) and values[key] and key not in names]
     if unserved and model in MODELS:
@@ -215,21 +215,21 @@ def _lens(entry: Mapping[str, Any], stored: tuple[int, int]) -> Lens:
 
 def _model(entry: Mapping[str, Any], terms: Mapping[str, float]) -> str:
     """Return the name of COLMAP's camera model."""
-    if entry.get("is_fisheye"):  # of instant-ngp
+    if entry.get("is_fisheye"):  # instant-ngp's key
         return "OPENCV_FISHEYE"
     name = str(entry.get("camera_model", "OPENCV")).upper()
     if name not in _OPENCV:
         return name
-    # nerfstudio's k3 is OpenCV's, of the sixth power of the radius. Its k4 is not.
+    # nerfstudio's k3, of the sixth power of the radius, is that of OpenCV; its k4 is not.
     return "FULL_OPENCV" if terms.get("k3") and not terms.get("k4") else "OPENCV"
 
 
 def _focal(entry: Mapping[str, Any], axis: str, side: int) -> float | None:
-    """Return the focal length along an axis, px; None where nothing gives it."""
+    """Return the focal length along an axis, px; None if it is missing."""
     if entry.get(f"fl_{axis}") is not None:
         return as_number(entry[f"fl_{axis}"])
     angle = entry.get(f"camera_angle_{axis}")
-    if angle is None and entry.get(f"{axis}_fov") is not None:  # of instant-ngp, in degrees
+    if angle is None and entry.get(f"{axis}_fov") is not None:  # instant-ngp's key, in degrees
         angle = math.radians(as_number(entry[f"{axis}_fov"]))
     if angle is None:
         return None
@@ -239,7 +239,7 @@ def _focal(entry: Mapping[str, Any], axis: str, side: int) -> float | None:
 
 
 def _viewmat(rows: object) -> NDArray[np.float64]:
-    """Invert a camera-to-world matrix of OpenGL's axes, [4, 4] or [3, 4], into a rigid viewmat."""
+    """Convert a camera-to-world matrix with OpenGL axes, [4, 4] or [3, 4], to a rigid viewmat."""
     matrix = np.array(rows, dtype=np.float64)
     if matrix.shape not in {(4, 4), (3, 4)} or not np.isfinite(matrix).all():
         raise ValueError("transform_matrix must be 4 x 4 finite numbers")
@@ -247,8 +247,8 @@ def _viewmat(rows: object) -> NDArray[np.float64]:
         raise ValueError(
             "transform_matrix must be of rows, the last of them 0, 0, 0, 1; is it of columns?"
         )
-    # Rounded digits make a rotation that is not quite one: the nearest rotation is taken. A scale
-    # of the camera's own axes changes no projection.
+    # Take the nearest rotation, to correct rounded digits. A scale of the camera's axes does not
+    # change projections.
     U, stretch, Vt = np.linalg.svd(matrix[:3, :3])
     if not stretch[2] > (1 - _MAX_SKEW) * stretch[0] or np.linalg.det(U @ Vt) < 0:
         raise ValueError("transform_matrix must be a rotation with a translation, not mirrored")

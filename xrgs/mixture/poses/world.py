@@ -1,9 +1,9 @@
-"""Moves given poses and points to a world of their own, wherever they are in the user's.
+"""Moves given poses and points to a standard world, near the origin.
 
-Float32 has 7 digits: a metre of a world in UTM's or Earth's coordinates would be a few steps of it.
-And training depends on the origin and the axes of the world, if little (`xrgs.splat.normalize`). So
-every world of given poses is moved, in float64: the cameras' mean becomes the origin, as COLMAP
-does with its own worlds, and the axes are the first camera's.
+In UTM or Earth coordinates, a metre would be only a few steps of float32, which has 7 digits.
+Training also depends slightly on the origin and axes of the world (`xrgs.splat.normalize`). So all
+given poses are moved, in float64: the mean of the cameras becomes the origin, as in COLMAP's
+models, and the axes are those of the first camera.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-#: Points that are rounded to more than this share of their distance are no points to begin with.
+#: Largest rounding of points relative to their distances; coarser points are not used.
 _MOST_ROUNDED = 1e-3
 
 
 def own_world(viewmats: Mapping[int, Array]) -> tuple[dict[int, Array], Array]:
-    """Move cameras to a world of their own.
+    """Move cameras to the standard world.
 
     Args:
-        viewmats: World to camera [4, 4], rigid, by the index of the photograph.
+        viewmats: Index of the photograph -> world to camera [4, 4], rigid.
 
     Returns:
-        The same in the new world, and the rigid transform [4, 4] from the given world to it.
+        The viewmats in the new world, and the rigid transform [4, 4] from the given world to it.
     """
     R = np.stack([matrix[:3, :3] for matrix in viewmats.values()])
     t = np.stack([matrix[:3, 3] for matrix in viewmats.values()])
@@ -54,11 +54,11 @@ def moved_points(points: Array, world: Array) -> Array:
 
 
 def rounding(points: Array, moved: Array) -> float | None:
-    """Return the steps of points that 32 bits have rounded coarsely; None where they are fine.
+    """Return the size of float32's rounding steps if it is too coarse for the points, else None.
 
     Args:
         points: Points [P, 3] in the given world.
-        moved: The same in the world of `own_world`.
+        moved: The points [P, 3] in the world of `own_world`.
     """
     as_32_bits = points.astype(np.float32)
     if not len(points) or not (as_32_bits == points).all():

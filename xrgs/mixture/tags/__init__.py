@@ -1,9 +1,9 @@
 """The policies that tag training views HR or LR by a property of the photographs: `variant.tags`.
 
-Each scores every view, and the views of the highest scores are HR. A new policy is one module of
-this folder, named after the value of the key, and one line in `POLICIES`. The key of a variant has
-the code of the policy that it uses, and not the code of the others. `flag` is no policy: it draws
-the HR views by `variant.selection`.
+A policy scores every view, and the views with the highest scores are HR. To add one, add a module
+to this folder, named after the value of the config's key, and a line to `POLICIES`. A variant's key
+includes only the code of its own policy. The value `flag` has no policy: it selects HR views by
+`variant.selection`.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ class TagPolicy(Protocol):
     """Scores views."""
 
     needs_depth: bool
-    """Whether it needs cameras and points, and so is applied after SfM."""
+    """Whether the policy needs cameras and points, and so is applied after SfM."""
 
     def score(self, view: Measures) -> float:
-        """Return a number above 0, higher for HR. NaN, where it is not known, makes the view LR."""
+        """Return a number above 0, higher for HR. NaN (unknown) makes the view LR."""
 
 
 POLICIES: dict[str, TagPolicy] = {

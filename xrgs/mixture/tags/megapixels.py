@@ -14,6 +14,6 @@ class Megapixels:
     needs_depth = False
 
     def score(self, view: Measures) -> float:
-        """Return the pixel count of the photograph as it was taken."""
+        """Return the pixel count of the original photograph."""
         width, height = view.size
         return float(width * height)

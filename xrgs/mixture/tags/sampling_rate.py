@@ -1,4 +1,4 @@
-"""Tags views by their sampling rate, which pixel count and distance both determine."""
+"""Tags views by their sampling rate, which depends on both pixel count and distance."""
 
 from __future__ import annotations
 

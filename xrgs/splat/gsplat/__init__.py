@@ -1,1 +1,1 @@
-"""The renderer of gsplat on a GPU; all else of this backend is `xrgs/splat/torch`."""
+"""The renderer of gsplat on a GPU; the other operations of this backend are `xrgs/splat/torch`."""

@@ -1,6 +1,6 @@
-"""`gsplat.rasterization` [ye2025] as a rasterizer of the model, for gsplat 1.5.3 and 1.6.
+"""Rendering by `gsplat.rasterization` [ye2025], for gsplat 1.5.3 and 1.6.
 
-Importing this module loads gsplat's CUDA kernels; the first time on a machine, gsplat compiles
+Importing this module loads gsplat's CUDA kernels. The first time on a machine, gsplat compiles
 them, which takes minutes.
 """
 
@@ -27,7 +27,7 @@ def _load() -> Any:
     """Return gsplat with its kernels.
 
     Raises:
-        XrgsError: There is no GPU, or there are no kernels; the message says what is missing.
+        XrgsError: There is no GPU or no kernels; the message says what is missing.
     """
     if DEVICES["gsplat"] == "cuda" and not torch.cuda.is_available():
         built = f"CUDA {torch.version.cuda}" if torch.version.cuda else "the CPU only"
@@ -49,7 +49,7 @@ def _load() -> Any:
             f"splat.backend=gsplat: gsplat's kernels can't be loaded ({reason}); to compile them"
             " takes nvcc of torch's CUDA, on the PATH or below CUDA_HOME, a C++ compiler and ninja"
         ) from failure
-    # Or the convolutions of the loss would keep 10 bits of each factor.
+    # TF32 would cut the factors in the loss's convolutions to 10 bits.
     torch.backends.cudnn.allow_tf32 = False
     return gsplat
 
@@ -69,23 +69,23 @@ def render(
     """Render Gaussians into one view as `xrgs.splat.rendering.rasterize_parameters` does.
 
     Args:
-        gaussians: N Gaussians, float32 on the GPU, whose shapes have been checked. Values that are
-            not finite are not refused.
+        gaussians: N Gaussians, float32 on the GPU, whose shapes have been checked. Values may be
+            infinite or NaN.
         camera: The view.
         settings: How Gaussians become pixels.
         sh_degree: Highest band of the spherical harmonics that is on.
-        means2d_offset: [N, 2] of `zero_means2d_offset`, which gets the image-plane gradient; None
-            where that is not needed.
+        means2d_offset: [N, 2] made by `zero_means2d_offset`, whose `grad` becomes the image-plane
+            gradient; None if that is not needed.
         raw: Whether scales and opacities are natural logarithms and logits.
 
     Returns:
-        The render, once differentiable in every parameter; `backward` gives the offset its `grad`.
-        A Gaussian is `visible` where its radii in px, rounded up, reach the image. `evaluations`
-        counts all pixels of a tile, finished or not. `buffer_bytes` is 0: `TrainingMemory` counts
-        what torch allocates on a GPU, which includes gsplat's buffers.
+        The render, once differentiable in every parameter; `backward` sets the offset's `grad`. A
+        Gaussian is `visible` if its radii in px, rounded up, reach the image. `evaluations` counts
+        all pixels of a tile, also saturated ones. `buffer_bytes` is 0: on a GPU, `TrainingMemory`
+        counts all that torch allocates, gsplat's buffers included.
 
     Raises:
-        ValueError: The offset is not of `zero_means2d_offset`, since gsplat adds none.
+        ValueError: The offset is not made by `zero_means2d_offset`: gsplat can't add an offset.
         XrgsError: A setting differs from the constants of gsplat's kernels.
     """
     check_raster("gsplat", settings)
@@ -129,10 +129,11 @@ def render(
 
 
 def _with_gradient_of(means2d_offset: Tensor, means: Tensor, absgrad: bool) -> Tensor:
-    """Return the means; their backward pass gives the offset the gradient of gsplat's `means2d`.
+    """Return the means with a hook that copies the gradient of gsplat's `means2d` to the offset.
 
-    The gradient of the means is complete after all of gsplat's. The graph must not hold `means2d`,
-    which holds the graph: the offset does, and the graph has a weak reference to the offset.
+    The hook runs after gsplat's backward pass, when the gradient of `means2d` is complete.
+    `means2d` holds the graph, so a hook that holds `means2d` would never be freed: the offset holds
+    `means2d`, and the hook has a weak reference to the offset.
     """
     means, offset_of = means.view_as(means), weakref.ref(means2d_offset)
 

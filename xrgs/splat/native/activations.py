@@ -1,7 +1,7 @@
 """The activation functions of the raw parameters by the compiled kernels.
 
-Their bits do not depend on the processor or on the number of threads; the last bits of torch's
-functions do.
+The results have the same bits on every processor and for any number of threads; the last bits of
+torch's functions differ.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from xrgs.splat.native.arguments import require_float32
 def exp(x: Tensor) -> Tensor:
     """Return e^x: scales from their natural logarithms.
 
-    The relative error is below 1.0e-7. A result below 2^-126 is 0, one above the largest float is
-    infinite, and NaN stays NaN.
+    The relative error is below 1.0e-7. A result below 2^-126 is 0, a result above the largest
+    float is infinite, and NaN stays NaN.
 
     Args:
         x: A float32 tensor of any shape, on the CPU.
@@ -67,7 +67,7 @@ def activate(scales: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor]:
 class _ScalesAndOpacities(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, scales: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor]:
-        ctx.set_materialize_grads(False)  # Adam leaves alone what has no gradient, not zeros
+        ctx.set_materialize_grads(False)  # None, not zeros: Adam then skips the parameter
         threads = torch.get_num_threads()
         exp = _native.exp(scales.detach().reshape(-1), threads).view(scales.shape)
         logistic = _native.logistic(opacities.detach().contiguous(), threads)
@@ -101,7 +101,7 @@ def _activate(x: Tensor, forward: _Forward, backward: _Backward) -> Tensor:
 
 
 class _Activation(torch.autograd.Function):
-    """A function of single elements, whose derivative is a function of its value."""
+    """An elementwise function whose derivative is computed from its value."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, forward: _Forward, backward: _Backward) -> Tensor:

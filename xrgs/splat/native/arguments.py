@@ -1,4 +1,4 @@
-"""The checks of arguments that the native operations have in common."""
+"""Checks of arguments for all native operations."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import torch
 from torch import Tensor
 from torch.utils.dlpack import to_dlpack  # type: ignore[attr-defined]
 
-#: What the kernels take for a tensor: a handle on its memory, without its graph. Of a tensor they
-#: would ask for it by `Tensor.__dlpack__`, which is written in Python and takes ten times as long.
+#: Makes the DLPack capsule of a tensor, which the kernels take in its place. Given a tensor, they
+#: would call `Tensor.__dlpack__`, which is written in Python and takes ten times as long.
 handle = to_dlpack
 
 
 def require_float32(name: str, value: Tensor) -> None:
-    """Raise ValueError unless a tensor, named in the message, is float32 on the CPU."""
+    """Raise ValueError, naming the tensor, unless it is float32 on the CPU."""
     if value.dtype != torch.float32 or value.device.type != "cpu":
         raise ValueError(
             f"{name} must be float32 on the CPU for the native backend, got {value.dtype} on"

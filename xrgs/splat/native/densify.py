@@ -16,17 +16,11 @@ def accumulate_statistics(
     grad2d_sum: Tensor,
     visible_count: Tensor,
 ) -> None:
-    """Add the image-plane gradients of a step to the sums that densification decides by.
-
-    Args:
-        means2d_grad: [N, 2] float32 gradient of the loss by the projected means, per px.
-        visible: [N] bool; Gaussians that are not visible add nothing, whatever their gradient.
-        half_size: Half the view's width and height, px: the factors to normalised device units.
-        grad2d_sum: [N] float32 to which the gradients' norms are added in place.
-        visible_count: [N] float32 to which 1 is added in place where visible.
+    """Add a step's image-plane gradients as `xrgs.splat.torch.densify.accumulate_statistics` does.
 
     Raises:
-        ValueError: A tensor has another type or shape, or a sum is not contiguous.
+        ValueError: A tensor has the wrong type or shape (floats must be float32), or
+            `grad2d_sum` or `visible_count` is not contiguous.
     """
     require_float32("means2d_grad", means2d_grad)
     if visible.dtype != torch.bool:
@@ -41,6 +35,6 @@ def accumulate_statistics(
         handle(visible_count),
         torch.get_num_threads(),
     )
-    # So that autograd refuses to use the values from before.
+    # The kernel writes in place: autograd must refuse the old values.
     torch.autograd.graph.increment_version(grad2d_sum)
     torch.autograd.graph.increment_version(visible_count)

@@ -15,7 +15,7 @@ _WINDOW = torch.tensor(WEIGHTS, dtype=torch.float64, device="cpu")
 
 
 def target_moments(image: Tensor) -> tuple[Tensor, Tensor]:
-    """Return `xrgs.splat.torch.loss.target_moments`, with the same bits for any number of threads.
+    """Compute `xrgs.splat.torch.loss.target_moments`, with the same bits for any thread count.
 
     Moments below 1.2e-38 are zero.
 
@@ -38,21 +38,11 @@ def target_moments(image: Tensor) -> tuple[Tensor, Tensor]:
 def photometric_loss(
     image: Tensor, target: Target, l1: float, ssim: float, pixel_weight: Tensor | None
 ) -> Tensor:
-    """Return `xrgs.splat.loss.photometric_loss`; once differentiable, by the image only.
+    """Compute `xrgs.splat.loss.photometric_loss`, once differentiable with respect to the image.
 
     Sums are in double and in a fixed order: value and gradient have the same bits for any number of
-    threads. If the image, its target or the weight of a window is NaN, so are the loss and the
-    gradient of the pixels under the same windows.
-
-    Args:
-        image: [H, W, 3] render, float32 on the CPU, of any strides.
-        target: The photograph, of the same shape and type.
-        l1: Weight of the absolute difference.
-        ssim: Weight of the structural dissimilarity.
-        pixel_weight: [H, W], float32 on the CPU, of any strides; None weighs all pixels 1.
-
-    Returns:
-        A scalar.
+    threads. A NaN in the image, the target or the weights makes the loss NaN, and the gradients of
+    all pixels that share a window with it. Tensors may have any strides.
 
     Raises:
         ValueError: `image`, `target` or `pixel_weight` is not float32 on the CPU, or `pixel_weight`
@@ -100,5 +90,5 @@ class _Photometric(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, v_loss: Tensor) -> tuple[Tensor, None, None, None, None]:
         (gradient,) = ctx.saved_tensors
-        # Without a factor, a pass over the image is saved.
+        # A factor of 1 needs no pass over the image.
         return gradient if v_loss.item() == 1 else gradient * v_loss, None, None, None, None

@@ -17,22 +17,12 @@ if TYPE_CHECKING:
 
 
 def step(optimizer: SplatOptimizer, camera: Camera | None = None, sh_degree: int = 0) -> None:
-    """Move every parameter that has a gradient, in one pass over memory.
+    """Take Adam's step as `xrgs.splat.torch.optimizer.step` does, in one pass over memory.
 
-    The formula is torch's, in torch's order, with one rounding fewer where a multiplication and an
-    addition are fused (`tests/splat/native/test_optimizer.py` has the bounds). A value is not
-    written if its gradient and moments are zero, as for harmonics that are not on yet. The result
-    has the same bits for any number of threads.
-
-    With a camera, the gradient of shN is computed from the gradient of sh0 as shN moves, and never
-    written to memory.
-
-    Args:
-        optimizer: The parameters with their gradients, and Adam's state of them, which is updated:
-            float32 on the CPU, contiguous. Parameters without a gradient stay as they are.
-        camera: The view that the gradients come from; None leaves shN as it is, unless it has a
-            gradient (`SplatOptimizer.step`).
-        sh_degree: Highest band of the spherical harmonics that was rendered.
+    The formula and its order are torch's; a fused multiply-add rounds once instead of twice
+    (`tests/splat/native/test_optimizer.py` has the bounds). A value whose gradient and moments are
+    zero, as of harmonics that are not on yet, is not written. The result has the same bits for any
+    number of threads. With a camera, the gradient of shN is never written to memory.
 
     Raises:
         ValueError: A parameter, gradient or moment is not float32 on the CPU and contiguous.
@@ -54,7 +44,7 @@ def step(optimizer: SplatOptimizer, camera: Camera | None = None, sh_degree: int
         moved.append(parameter)
     settings, threads = optimizer.settings, torch.get_num_threads()
     _native.adam_step(entries, settings.beta1, settings.beta2, settings.eps, threads, harmonics)
-    # So that a backward pass refuses to use the values from before.
+    # The kernel writes in place: autograd must refuse the old values.
     for tensor in moved:
         torch.autograd.graph.increment_version(tensor)
 
@@ -62,7 +52,7 @@ def step(optimizer: SplatOptimizer, camera: Camera | None = None, sh_degree: int
 def _harmonics(
     optimizer: SplatOptimizer, gradient: Tensor, camera: Camera, sh_degree: int
 ) -> tuple[Any, ...]:
-    """Return the argument that moves shN by what the gradient of sh0 implies."""
+    """Return the kernel's argument for deriving the gradient of shN from that of sh0."""
     gaussians = optimizer.gaussians
     exp_avg, exp_avg_sq, number = optimizer.adam_of("shN")
     return (
@@ -77,7 +67,7 @@ def _harmonics(
 
 
 def _plain_handle(name: str, value: Tensor) -> Any:
-    """Return a tensor's handle; ValueError unless float32, contiguous, on the CPU."""
+    """Return the tensor's DLPack capsule; ValueError unless float32, contiguous, on the CPU."""
     if value.dtype != torch.float32 or value.device.type != "cpu" or not value.is_contiguous():
         raise ValueError(
             f"{name} and its gradient must be float32, contiguous, on the CPU for the native"

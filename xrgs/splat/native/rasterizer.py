@@ -1,8 +1,8 @@
 """The compiled rasterizer (`xrgs/csrc/raster`) as a torch operation.
 
 It renders the same image as `xrgs.splat.torch.rasterizer`, many times faster, in float32 on the
-CPU. A `Frame` holds what a forward pass keeps for its backward pass; the next render uses its
-memory again.
+CPU. A `Frame` holds the buffers of a forward pass that its backward pass needs; the next render
+reuses their memory.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from xrgs.splat.settings import CullingOptions, RasterSettings
 _TILE = 16
 """Side of a tile, px: `kTileSize` of `xrgs/csrc/raster/types.h`."""
 _CULLING = [field.name for field in fields(CullingOptions)]
-"""The options in the order in which `RenderConfig` takes them."""
+"""Names of the culling options, in the order of `RenderConfig`'s argument."""
 _FIRST_PARAMETER = 2
-"""Place of the first parameter among the arguments of `_Rasterize.forward`."""
+"""Index of the first parameter among the arguments of `_Rasterize.forward`."""
 _SHN_INPUT = _FIRST_PARAMETER + PARAMETERS.index("shN")
-"""Place of shN among them."""
+"""Index of shN among the arguments of `_Rasterize.forward`."""
 
 
 def render(
@@ -43,7 +43,7 @@ def render(
 ) -> Render:
     """Render Gaussians into one view as `xrgs.splat.rendering.rasterize_parameters` does.
 
-    It uses as many threads as torch (`torch.set_num_threads`). The result has the same bits for any
+    The number of threads is torch's (`torch.set_num_threads`). The result has the same bits for any
     number of threads.
 
     Args:
@@ -52,14 +52,14 @@ def render(
         settings: How Gaussians become pixels.
         sh_degree: Highest band of the spherical harmonics that is on.
         means2d_offset: [N, 2] px, added to the projected means; None for zeros.
-        raw: Whether scales and opacities are natural logarithms and logits. The kernels activate
-            them as they read them: image and gradients have the bits that `activate` and `render`
-            give, with a pass over memory less in either direction.
+        raw: Whether scales and opacities are natural logarithms and logits. The kernels then
+            activate them while reading: image and gradients have the bits of `activate` and then
+            `render`, and one pass over memory is saved forward and one backward.
 
     Returns:
         The render, once differentiable in every parameter and the offset. Its backward pass raises
         ValueError if a needed gradient is not finite. The message names the parameter, or the
-        incoming gradient, `v_image` or `v_alpha`, if this is not finite already.
+        incoming gradient `v_image` or `v_alpha` if that one is not finite.
 
     Raises:
         ValueError: A parameter is not float32 on the CPU, or has values that are not finite or out
@@ -82,10 +82,10 @@ def render_culled(
     *,
     raw: bool = False,
 ) -> Render:
-    """Render as `render` does, with some kinds of culling off, so that these can be measured.
+    """Render as `render` does, with some kinds of culling off, to measure what culling saves.
 
-    The image is the same and takes longer. Without `out_of_view` or `sub_threshold`, the Gaussians
-    that these would cull count as visible.
+    The image is the same. Without `out_of_view` or `sub_threshold`, Gaussians that would have been
+    culled count as visible.
     """
     require_float32("means", gaussians.means)
     frame = _native.Frame()
@@ -109,7 +109,7 @@ def render_config(
     *,
     raw: bool = False,
 ) -> _native.RenderConfig:
-    """Return the config of `_native.Frame.forward`.
+    """Convert camera and settings to the config of `_native.Frame.forward`.
 
     Raises:
         ValueError: float32 cannot hold a number of the camera or the settings.
@@ -142,7 +142,7 @@ def _handles(tensors: Sequence[Tensor | None]) -> list[Any]:
 
 
 class _Rasterize(torch.autograd.Function):
-    """Image [H, W, 3] and alpha [H, W] of a frame, view, the six parameters and the offset."""
+    """Render image [H, W, 3] and alpha [H, W] from frame, view, six parameters and offset."""
 
     @staticmethod
     def forward(

@@ -1,4 +1,4 @@
-"""Image resampling by the compiled kernels, which store the few nonzero weights of each sample."""
+"""Image resampling by the compiled kernels, with matrices that store only the nonzero weights."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from xrgs.splat.native.arguments import require_float32
 
 
 class BandedMatrix(NamedTuple):
-    """A matrix [new, old] whose rows are zero but for `taps` values side by side."""
+    """A matrix [new, old] whose rows have at most `taps` adjacent nonzero values."""
 
     first: Tensor  # [new] int32, column of a row's first weight
     weights: Tensor  # [new, taps] float32
@@ -25,18 +25,8 @@ class BandedMatrix(NamedTuple):
 def resize(image: Tensor, height: int, width: int, variances: Tensor | None = None) -> Tensor:
     """Resample an image as `xrgs.splat.resample.resize` does; once differentiable.
 
-    The gradient is the product with the exact transpose. Image and gradient have the same bits for
-    any number of threads. A value that is not finite reaches only the samples in which its pixel
-    has a weight.
-
-    Args:
-        image: [H, W, 3] float32 on the CPU, of any strides.
-        height: Height of the result, px.
-        width: Width of the result, px.
-        variances: [2] variances of the blur, down and across, px^2 of `image`; None does not blur.
-
-    Returns:
-        [height, width, 3]
+    The backward pass multiplies by the exact transpose. Image and gradient have the same bits for
+    any number of threads. An infinite or NaN pixel affects only the samples within its filter.
 
     Raises:
         ValueError: `image` is not float32 on the CPU.
@@ -56,8 +46,8 @@ def banded_matrix(old: int, new: int, *, transposed: bool = False) -> BandedMatr
 
     Args:
         old: Number of samples along the axis before resampling.
-        new: Number of samples after it.
-        transposed: Whether to return the transpose, which the gradient is multiplied by.
+        new: Number of samples after resampling.
+        transposed: Whether to return the transpose, for the backward pass.
 
     Returns:
         The matrix [new, old], or [old, new] if transposed.
@@ -65,11 +55,11 @@ def banded_matrix(old: int, new: int, *, transposed: bool = False) -> BandedMatr
     dense = bicubic_matrix(old, new).T if transposed else bicubic_matrix(old, new)
     nonzero = dense != 0
     column = torch.arange(dense.shape[1])
-    # A row without a weight (a pixel between the samples of a much smaller image) takes any band.
+    # A row without weights (a pixel between the samples of a much smaller image) may have any band.
     first = torch.where(nonzero, column, dense.shape[1] - 1).amin(dim=1)
     last = torch.where(nonzero, column, 0).amax(dim=1)
     taps = max(1, int((last - first).max()) + 1)
-    first = first.clamp_max(dense.shape[1] - taps)  # weights before a row's own are zero
+    first = first.clamp_max(dense.shape[1] - taps)  # leading weights are then zero
     weights = dense.gather(1, first[:, None] + torch.arange(taps))  # [new, taps]
     return BandedMatrix(first.int(), weights.float().contiguous())
 
@@ -77,27 +67,27 @@ def banded_matrix(old: int, new: int, *, transposed: bool = False) -> BandedMatr
 class _BlurredAxis:
     """Blurs an axis and resamples it: `bicubic_matrix(old, new)` times the matrix of the blur.
 
-    The matrices are new for each variance, so they are made as bands, and not kept.
+    The matrices differ for each variance, so they are not cached, and made as bands directly.
     """
 
     def __init__(self, old: int, new: int, variance: float) -> None:
-        """Sample the blur.
+        """Compute the kernel and the matrix.
 
         Args:
             old: Number of samples along the axis before resampling.
-            new: Number of samples after it.
+            new: Number of samples after resampling.
             variance: Variance of the blur, px^2 before resampling.
         """
         self.old, self.new = old, new
-        # exp(-t) I_n(t) at n px, for the variance t. Beyond five standard deviations float32 does
-        # not hold it; a variance far below 1 has longer tails.
+        # exp(-t) I_n(t) at n px, for the variance t. Beyond five standard deviations it is below
+        # float32's precision; 4 px more are for the longer tails of a variance far below 1.
         half = torch.from_numpy(ive(range(ceil(5 * sqrt(variance)) + 4), variance))
         kernel = torch.cat([half.flip(0)[:-1], half])
         self.kernel = kernel / kernel.sum()
         self.matrix = self._resampled(self.kernel)
 
     def transposed(self) -> BandedMatrix:
-        """Return the transpose [old, new], which the gradient is multiplied by."""
+        """Return the transpose [old, new], for the backward pass."""
         first, weights = self.matrix
         taps = weights.shape[1]
         column = torch.arange(self.old, dtype=first.dtype)
@@ -113,11 +103,11 @@ class _BlurredAxis:
 
     def slope(self) -> BandedMatrix:
         """Return the derivative of the matrix by the variance."""
-        # The blur solves the heat equation: its derivative is half its second difference.
+        # The blur solves the heat equation: the derivative is half the second difference.
         return self._resampled(torch.nn.functional.pad(self.kernel, (2, 2)).diff(n=2) / 2)
 
     def _resampled(self, kernel: Tensor) -> BandedMatrix:
-        """The product of resampling and the convolution with a kernel, whose borders reflect."""
+        """Return resampling after a convolution with `kernel` that reflects at the borders."""
         first, weights = banded_matrix(self.old, self.new)
         taps, size = weights.shape[1], len(kernel)
         lag = torch.arange(taps + size - 1) - torch.arange(taps)[:, None]
@@ -164,7 +154,7 @@ class _BlurredResize(torch.autograd.Function):
             _resample(image, rows.slope(), columns.matrix),
             _resample(image, rows.matrix, columns.slope()),
         )
-        # In double: the order in which torch adds depends on the processor and on the threads.
+        # In double, since the order in which torch adds depends on processor and thread count.
         sums = [(v_resized * slope).sum(dtype=torch.float64) for slope in slopes]
         return v_image, torch.stack(sums), None, None
 

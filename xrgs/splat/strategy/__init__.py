@@ -1,6 +1,5 @@
-"""Strategies of densification: what grows, prunes, resets and moves Gaussians during training.
+"""Strategies of densification, which grow, prune, reset and move Gaussians during training.
 
-`base.Strategy` is what the training loop calls. `default.DefaultStrategy` is gsplat's default, and
-`mcmc.MCMCStrategy` its other one. `refinement` has what a strategy is told and what it reports,
-`ops` what strategies share.
+The training loop calls a `base.Strategy`: `default.DefaultStrategy` or `mcmc.MCMCStrategy`, as in
+gsplat. `refinement` has the types of their inputs and results, `ops` the functions that they share.
 """

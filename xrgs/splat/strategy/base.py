@@ -20,21 +20,21 @@ NO_HOOKS = StrategyHooks()
 
 
 class Strategy(ABC):
-    """Decides which Gaussians there are: gsplat's `Strategy` (`strategy/base.py`).
+    """Adds, removes and changes Gaussians between steps: gsplat's `Strategy` (`strategy/base.py`).
 
-    A strategy owns
+    A strategy is responsible for
 
     - the statistics of the steps since the last refinement,
     - the growth of Gaussians,
-    - pruning, opacity resets and other changes that are no steps of the optimizer,
-    - the part of a checkpoint that holds all of these.
+    - pruning, opacity resets and other changes outside the optimizer's steps,
+    - the part of a checkpoint for all of these.
 
-    It adds and removes Gaussians through the optimizer alone, so that Adam's moments follow.
-    `DefaultStrategy` shows the loop that calls it.
+    It adds and removes Gaussians only through the optimizer, so that Adam's moments follow. The
+    example of `DefaultStrategy` is the training loop around it.
 
     Attributes:
-        asks_components: Whether components decide what grows: by `groups`, `StrategyHooks.may_grow`
-            and `StrategyHooks.growth_scores`.
+        asks_components: Whether training components influence growth: by `groups`,
+            `StrategyHooks.may_grow` and `StrategyHooks.growth_scores`.
     """
 
     asks_components: ClassVar[bool] = True
@@ -52,16 +52,16 @@ class Strategy(ABC):
         """Start before the first step.
 
         Args:
-            optimizer: Holds the Gaussians.
-            settings: Schedule and thresholds; `DensifySettings.scaled` fits them to the run.
+            optimizer: Optimizer of the Gaussians.
+            settings: Schedule and thresholds, already scaled to the run (`DensifySettings.scaled`).
             scene_scale: Extent of the scene, world units.
             generator: Draws all random numbers of the strategy.
-            groups: Thresholds of groups of views; None takes the ones in `settings` for all views.
-            view_pixels: Number of pixels of the largest training view, which `settings.budget` is
-                multiplied by; only read where there is a budget.
+            groups: Thresholds for each group of views; None applies those of `settings` to all.
+            view_pixels: Number of pixels of the largest training view; only read with a
+                `settings.budget`, which is per pixel.
 
         Raises:
-            ValueError: The strategy has no groups and got some, or it needs a budget.
+            ValueError: The strategy does not support `groups`, or needs a budget.
         """
         self.optimizer = optimizer
         self.gaussians = optimizer.gaussians
@@ -74,7 +74,7 @@ class Strategy(ABC):
 
     @abstractmethod
     def _begin(self) -> None:
-        """Set what the strategy has of its own, when all arguments are set."""
+        """Initialise the attributes of the subclass, after those of this class."""
 
     @abstractmethod
     def after_step(
@@ -88,20 +88,20 @@ class Strategy(ABC):
         group: str = "",
         hooks: StrategyHooks = NO_HOOKS,
     ) -> Refinement:
-        """Take in a step's gradients and, where the schedule says so, change the Gaussians.
+        """Add a step's gradients to the statistics and, if it is due, refine the Gaussians.
 
         Args:
             step: Number of the step, from 0. The optimizer has taken its step already.
             means2d_grad: [N, 2] gradient of the loss with respect to the projected means, per px;
-                None where the step had no backward pass or its render shows no Gaussian.
+                None if the step had no backward pass or its render shows no Gaussian.
             visible: [N] bool, whether the step's view shows the Gaussian.
             width: Width of the render, px.
             height: Height of the render, px.
-            group: Group of the view; only read where there are groups.
-            hooks: What components of training decide at this step, where `asks_components`.
+            group: Group of the view; only read if there are groups.
+            hooks: Decisions of the training components; ignored unless `asks_components`.
 
         Returns:
-            The counts of what was done.
+            The numbers of changed Gaussians.
 
         Raises:
             KeyError: There are groups, and `group` is none of them.
@@ -112,19 +112,19 @@ class Strategy(ABC):
         """Remove Gaussians with their moments and statistics, at any step.
 
         Args:
-            mask: [N] bool, which Gaussians.
+            mask: [N] bool, the Gaussians to remove.
 
         Returns:
-            The number of Gaussians that were removed.
+            The number of removed Gaussians.
         """
 
     @abstractmethod
     def state_dict(self) -> dict[str, Any]:
-        """Return what the steps so far have changed, for a checkpoint."""
+        """Return the strategy's state for a checkpoint."""
 
     @abstractmethod
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore a result of `state_dict`, after the optimizer has restored its Gaussians.
+        """Restore a state of `state_dict`, after the optimizer has restored its Gaussians.
 
         Raises:
             KeyError: An entry is missing.
@@ -142,10 +142,10 @@ class Strategy(ABC):
         return largest
 
     def _finite(self) -> Tensor:
-        """Return which Gaussians [N] are finite in all parameters and largest scale."""
+        """Return for which Gaussians [N] all parameters and the largest scale are finite."""
         finite = torch.isfinite(self._largest_scale())  # [N]
         for name in PARAMETERS:
-            # Zero times a finite number is zero; `isfinite` and `all` take ten times as long.
+            # 0 * x is 0 only for finite x; `isfinite` and `all` take ten times as long.
             finite &= (0 * self.gaussians[name].detach()[..., None]).flatten(1).sum(dim=1) == 0
         return finite
 

@@ -1,9 +1,12 @@
-"""Adaptive density control [kerbl2023, section 5.2] as gsplat's default strategy has it.
+"""Adaptive density control [kerbl2023, section 5.2] as in gsplat's default strategy.
 
 Given the same inputs, the results are those of `DefaultStrategy` of gsplat [ye2025] 1.5.3, with two
-exceptions. Opacities are reset; gsplat 1.5.3 means to, but its `step % reset_every == 0 & step > 0`
-compares with `0 & step`, which pull request 776 mends. With `DensifySettings.resets` of False there
-are no resets, as in 1.5.3. And a split draws its random numbers in double.
+exceptions:
+
+- Opacities are reset. By mistake, gsplat 1.5.3 never resets them: Python reads its condition
+  `step % reset_every == 0 & step > 0` as a comparison with `0 & step` (pull request 776 fixes it).
+  `DensifySettings.resets` of False is the behaviour of 1.5.3.
+- A split draws its random numbers in double.
 
 On the native backend the results do not depend on the number of threads or on the processor.
 """
@@ -37,32 +40,32 @@ _COUNTED_BY_GROUP = ("grown", "pruned_opacity")
 
 
 class DefaultStrategy(Strategy):
-    """Grows and prunes by the image-plane gradient: the default of 3D Gaussian Splatting.
+    """Grows Gaussians by their image-plane gradient: the method of 3D Gaussian Splatting.
 
     gsplat's `DefaultStrategy` (`strategy/default.py`):
 
-    - It refines at the steps above `start` and below `stop` that `every` divides. A Gaussian grows
-      if the mean norm of its image-plane gradient, over the views that showed it since the last
-      refinement, is above `grow_grad2d`.
+    - It refines at steps above `start` and below `stop` that are a multiple of `every`. A Gaussian
+      grows if the norm of its image-plane gradient, averaged over the views that showed it since
+      the last refinement, is above `grow_grad2d`.
     - A growing Gaussian is duplicated if its largest scale is at most `grow_scale3d * scene_scale`,
       else split in two.
     - Then it prunes Gaussians with an opacity below `prune_opacity` and, after step `reset_every`,
       those with a scale above `prune_scale3d * scene_scale`.
-    - At the steps above 0 and below `stop` that `reset_every` divides, it caps opacities at
+    - At steps above 0 and below `stop` that are a multiple of `reset_every`, it caps opacities at
       `reset_opacity * prune_opacity`, unless `resets` is False.
 
-    gsplat has no counterpart of three options:
+    Three options are not in gsplat:
 
-    - With `split=long_axis` every growing Gaussian is split, along its longest axis.
-    - Within a budget (`xrgs.splat.strategy.ops.Budget`) the Gaussians of the highest scores grow,
-      up to the refinement's cap. Nothing is removed for the budget itself: what pruning removes
-      makes room for the next refinement.
+    - `split=long_axis` splits every growing Gaussian along its longest axis.
+    - With a budget (`xrgs.splat.strategy.ops.Budget`) only the Gaussians with the highest scores
+      grow, up to the cap at this refinement. Nothing is removed to meet the budget; pruning makes
+      room for the next refinement.
     - `groups` replaces `grow_grad2d` and `prune_opacity` by thresholds for each group of views.
 
     Attributes:
         grad2d_sum: [G, N] sum of the norms of the image-plane gradients, in normalised device
-            units; G statistics, 1 unless each group has its own.
-        visible_count: [G, N] number of views that were summed.
+            units. G is the number of groups if each has its own statistics, else 1.
+        visible_count: [G, N] number of views in the sum.
 
     Examples:
         >>> strategy = DefaultStrategy(  # doctest: +SKIP
@@ -88,7 +91,7 @@ class DefaultStrategy(Strategy):
         self.group_thresholds = {} if groups is None else dict(groups.thresholds)
         self.decide = "current_view" if groups is None else groups.decide
         self.per_group = self.decide != "current_view"
-        #: Which of the G statistics the views of each group add to.
+        #: Group -> row of the G statistics for its views.
         self.group_rows = {
             name: row if self.per_group else 0 for row, name in enumerate(self.group_thresholds)
         }
@@ -107,7 +110,7 @@ class DefaultStrategy(Strategy):
         group: str = "",
         hooks: StrategyHooks = NO_HOOKS,
     ) -> Refinement:
-        """Add to the statistics and, where the schedule says so, refine and reset."""
+        """Add the step to the statistics; refine and reset if it is due."""
         settings = self.settings
         if step >= settings.stop:
             return Refinement()
@@ -153,7 +156,7 @@ class DefaultStrategy(Strategy):
         self.generator.set_state(state["generator"])
 
     def _deciding_thresholds(self, group: str) -> dict[str, Thresholds]:
-        """Return thresholds for each of the G statistics, for a refinement after a group's view."""
+        """Return the thresholds for the G statistics, at a refinement after a view of `group`."""
         if self.per_group:
             return self.group_thresholds
         if self.group_thresholds:
@@ -164,8 +167,8 @@ class DefaultStrategy(Strategy):
     def _refine(
         self, step: int, deciding: Mapping[str, Thresholds], hooks: StrategyHooks
     ) -> Refinement:
-        """Remove what is not finite, grow, prune, and clear the statistics."""
-        # First, so that growing copies no such Gaussian and no hook renders one.
+        """Remove Gaussians that are not finite, grow, prune, and clear the statistics."""
+        # Remove first, so that such Gaussians are neither copied nor rendered by a hook.
         dropped = self.remove(~self._finite())
         above, high_gradient = self._above_thresholds(deciding)  # [G, N], [N]
         growing = self._choose(high_gradient, step, hooks)  # [N]
@@ -186,7 +189,10 @@ class DefaultStrategy(Strategy):
         return Refinement(pruned_non_finite=dropped, **grown, **pruned, by_group=by_group)
 
     def _above_thresholds(self, deciding: Mapping[str, Thresholds]) -> tuple[Tensor, Tensor]:
-        """Return which Gaussians are above each growth threshold [G, N], and which may grow [N]."""
+        """Return which Gaussians are above each growth threshold [G, N], and which are to grow [N].
+
+        The second result combines the G statistics as `Groups.decide` says.
+        """
         grow = self.grad2d_sum.new_tensor([t.grow_grad2d for t in deciding.values()])  # [G]
         mean_grad2d = self.grad2d_sum / self.visible_count.clamp_min(1)  # [G, N]
         above = mean_grad2d > grow[:, None]  # [G, N]
@@ -196,7 +202,7 @@ class DefaultStrategy(Strategy):
         return above, of_threshold > self.visible_count.sum(dim=0)
 
     def _choose(self, candidates: Tensor, step: int, hooks: StrategyHooks) -> Tensor:
-        """Return which of the Gaussians above the growth threshold, `candidates` [N], grow."""
+        """Return which of the `candidates` [N], the Gaussians above the growth threshold, grow."""
         may_grow = hooks.may_grow(self.gaussians)
         if may_grow is not None:
             candidates = candidates & may_grow
@@ -216,7 +222,7 @@ class DefaultStrategy(Strategy):
     def _accumulate(
         self, row: int, means2d_grad: Tensor, visible: Tensor, width: int, height: int
     ) -> None:
-        # gsplat's units: an image is 2 wide and 2 high, whatever its size in pixels.
+        # Normalised device units, as in gsplat: every image is 2 wide and 2 high.
         half_size = width / 2, height / 2
         accumulate = implementation("densify", self.optimizer.backend).accumulate_statistics
         sums = self.grad2d_sum[row], self.visible_count[row]
@@ -228,16 +234,16 @@ class DefaultStrategy(Strategy):
         self.visible_count = torch.zeros_like(self.grad2d_sum)
 
     def _deciding_row(self) -> Tensor:
-        """Return the first of the G statistics in which each Gaussian [N] is not 0, or the last."""
+        """Return for each Gaussian [N] the first row with a gradient sum above 0, else the last."""
         has_gradient = self.grad2d_sum > 0  # [G, N]
         has_gradient[-1] = True
         return has_gradient.int().argmax(dim=0)
 
     def _grow(self, growing: Tensor) -> tuple[dict[str, int], Tensor]:
-        """Duplicate or split where `growing` [N].
+        """Duplicate or split the Gaussians `growing` [N].
 
         Returns:
-            Counts, and the former index [M] of each Gaussian that is there now, or of its parent.
+            The counts, and for each of the M present Gaussians its former index or its parent's.
         """
         split = growing
         if self.settings.split == "random":
@@ -256,7 +262,7 @@ class DefaultStrategy(Strategy):
         return {"duplicated": int(duplicate.sum()), "split": int(split.sum())}, parents
 
     def _halves(self, old: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return the halves of Gaussians that are split: raw parameters [2 M, ...] by name."""
+        """Split Gaussians in two: name -> raw parameters [2 M, ...] of the halves."""
         scales = self._activations.exp(old["scales"])  # [M, 3]
         if self.settings.split == "long_axis":
             return split_along_longest_axis(old, scales)
@@ -265,15 +271,15 @@ class DefaultStrategy(Strategy):
     def _prune(
         self, thresholds: Tensor, deciding_row: Tensor, *, prune_large: bool
     ) -> tuple[dict[str, int], list[int]]:
-        """Remove Gaussians with a low opacity, or too large.
+        """Remove Gaussians whose opacity is too low or whose scale is too large.
 
         Args:
             thresholds: [G] opacities.
-            deciding_row: [N] which of the thresholds each Gaussian is pruned by.
-            prune_large: Whether Gaussians may be too large.
+            deciding_row: [N] row of the opacity threshold for each Gaussian.
+            prune_large: Whether to remove Gaussians for their scale.
 
         Returns:
-            Counts, and how many Gaussians each of the G thresholds removed.
+            The counts, and the number of Gaussians that each of the G thresholds removed.
         """
         low_opacity = (
             self._activations.logistic(self.gaussians.opacities) < thresholds[deciding_row]
@@ -290,13 +296,13 @@ class DefaultStrategy(Strategy):
 
     @torch.no_grad()
     def _reset_opacities(self, hooks: StrategyHooks) -> int:
-        """Cap the opacities, with moments of zero; return how many were above the cap."""
-        # Above every group's threshold: the next refinement would prune what is capped below it.
+        """Cap the opacities and set their moments to zero; return how many were above the cap."""
+        # The cap must be above every group's threshold, or the next refinement would prune.
         thresholds = self.group_thresholds.values() or [self.shared_thresholds]
         largest = max(threshold.prune_opacity for threshold in thresholds)
         cap_opacity = torch.tensor(self.settings.reset_opacity * largest, dtype=torch.float64)
-        # Where renders attenuate opacities, the attenuated ones are capped, as by Mip-Splatting
-        # [yu2024]: a cap of the others would leave Gaussians that are too faint to be rendered.
+        # If renders attenuate opacities, cap the attenuated ones, as Mip-Splatting [yu2024] does: a
+        # cap on the raw ones would leave Gaussians that are too faint to be rendered.
         attenuation = hooks.opacity_attenuation(self.gaussians)  # [N]
         if attenuation is not None:
             cap_opacity = (cap_opacity / attenuation.double()).clamp(max=_OPAQUE)

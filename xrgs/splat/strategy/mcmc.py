@@ -1,4 +1,4 @@
-"""3D Gaussian Splatting as Markov chain Monte Carlo [kheradmand2024], as gsplat has it.
+"""3D Gaussian Splatting as Markov chain Monte Carlo [kheradmand2024], as in gsplat.
 
 Given the same inputs and random draws, the results are those of `MCMCStrategy` of gsplat [ye2025]
 1.5.3, to the rounding of float32. On the native backend the results do not depend on the number of
@@ -23,13 +23,13 @@ from xrgs.splat.strategy.refinement import Refinement, StrategyHooks
 GROWTH = 1.05
 """Factor by which a refinement raises the number of Gaussians."""
 MOST_SHARES = 51
-"""A Gaussian is shared out to as many at most; more are counted as so many."""
+"""Limit of n in `share_out`, as in 3DGS-MCMC; larger numbers of copies are cut to it."""
 _OPAQUE = 1 - 2**-23
-"""Gaussians with a higher opacity are shared out as if they had this one."""
+"""Cap of the opacities in `share_out`."""
 _NOISE_STEEPNESS, _NOISE_OPACITY = 100, 0.995
-"""Noise falls off around an opacity of 1 - 0.995, as a logistic function with this slope."""
+"""The noise falls with opacity as a logistic function of slope 100, centred at 1 - 0.995."""
 _LEAST_NOISE = 2**-24
-"""Gaussians with a smaller share of the noise, of an opacity above 0.17, stay where they are."""
+"""Gaussians whose noise factor is smaller (opacity above 0.17) get no noise."""
 
 _COEFFICIENTS = torch.tensor(
     [
@@ -39,42 +39,42 @@ _COEFFICIENTS = torch.tensor(
     dtype=torch.float64,
     device="cpu",
 )
-"""The coefficient of o^m in `share_out` for n shares [n, m - 1]."""
+"""[n, m - 1] coefficient of o_n^m in the sum of `share_out`."""
 
 
 class MCMCStrategy(Strategy):
-    """Keeps a number of Gaussians, and moves the ones that show nothing to where others are.
+    """Moves transparent Gaussians to opaque ones, adds Gaussians up to a budget, and adds noise.
 
-    gsplat's `MCMCStrategy` (`strategy/mcmc.py`). At the steps above `start` and below `stop` that
-    `every` divides,
+    gsplat's `MCMCStrategy` (`strategy/mcmc.py`). At steps above `start` and below `stop` that are a
+    multiple of `every`,
 
     1. each dead Gaussian, with an opacity of at most `prune_opacity`, becomes a copy of a living
        one, which is drawn with a probability in proportion to its opacity;
-    2. copies of Gaussians, drawn in the same way, are added until there are 5% more Gaussians, or
-       as many as the budget says.
+    2. copies of Gaussians, drawn in the same way, are added until there are 5% more Gaussians or
+       the budget is reached.
 
-    A Gaussian and its copies share its opacity and scales (`share_out`), so that they render nearly
-    as it did alone. Adam's moments of a Gaussian that is copied are set to zero by 1, and stay as
-    they are by 2. The moments of a dead Gaussian stay, and the moments of an added one are zero.
+    A Gaussian and its copies share its opacity and scales (`share_out`), so that together they
+    render nearly as the Gaussian did. Adam's moments of a copied Gaussian are set to zero in 1, and
+    kept in 2. A relocated Gaussian keeps its own moments; an added one starts with zero.
 
     After every step of the run the means move by noise. With s the learning rate of means times
     `noise`, covariance C, opacity o and e normal with unit variance,
 
         mean += s / (1 + exp(-100 ((1 - o) - 0.995))) C e,
 
-    so that Gaussians which are nearly transparent explore. There are no resets, no pruning and no
-    rule against large Gaussians. gsplat's trainer adds penalties on opacities and scales
-    (`xrgs.training.components.regularization`), without which few Gaussians die.
+    so that nearly transparent Gaussians explore. There are no resets and no pruning. gsplat's
+    trainer adds penalties on opacities and scales (`xrgs.training.components.regularization`);
+    without them few Gaussians die.
 
-    Ours: the budget is in Gaussians for each pixel of the largest training view, where gsplat has a
-    number. Gaussians that are not finite are removed at refinements, and grow again. Gaussians with
-    an opacity above 0.17 get no noise, where gsplat's is below 6e-8 of s C e, which saves time.
+    Differences from gsplat: the budget is per pixel of the largest training view, not a number of
+    Gaussians. Refinements remove Gaussians that are not finite and add others in their place. To
+    save time, Gaussians with an opacity above 0.17 get no noise; gsplat's is below 6e-8 s C e.
     """
 
     asks_components: ClassVar[bool] = False
 
     def _begin(self) -> None:
-        """Find the largest number of Gaussians.
+        """Compute the largest number of Gaussians from the budget.
 
         Raises:
             ValueError: There are groups, or no budget.
@@ -97,11 +97,11 @@ class MCMCStrategy(Strategy):
         group: str = "",
         hooks: StrategyHooks = NO_HOOKS,
     ) -> Refinement:
-        """Refine where the schedule says so, then add noise to the means."""
+        """Refine if it is due, then add noise to the means."""
         del means2d_grad, visible, width, height, group, hooks
         settings, refinement = self.settings, Refinement()
         if settings.start < step < settings.stop and step % settings.every == 0:
-            # First: nothing that is not finite can be drawn from.
+            # Remove first: opacities that are not finite are no probabilities.
             dropped = self.remove(~self._finite())
             refinement = Refinement(
                 pruned_non_finite=dropped, relocated=self._relocate(), added=self._add()
@@ -123,7 +123,7 @@ class MCMCStrategy(Strategy):
         self.generator.set_state(state["generator"])
 
     def _relocate(self) -> int:
-        """Move the dead Gaussians to living ones; return how many."""
+        """Move the dead Gaussians to living ones; return the number moved."""
         opacities = self._opacities()
         is_dead = opacities <= self.settings.prune_opacity
         dead, living = (mask.nonzero()[:, 0] for mask in (is_dead, ~is_dead))
@@ -137,7 +137,7 @@ class MCMCStrategy(Strategy):
         return len(dead)
 
     def _add(self) -> int:
-        """Add Gaussians at others; return how many."""
+        """Add copies of Gaussians; return the number added."""
         count, opacities = len(self.gaussians), self._opacities()
         added = min(self.most, int(GROWTH * count)) - count
         if added <= 0 or not opacities.any():
@@ -148,17 +148,17 @@ class MCMCStrategy(Strategy):
         return added
 
     def _draw(self, opacities: Tensor, count: int) -> Tensor:
-        """Draw indices [count] of opacities [N] in proportion to them, with repetition."""
-        # In double: the sums of float32 depend on how torch adds.
-        weights = opacities.double().cpu()  # where the generator is
+        """Draw indices [count] with repetition, with probabilities in proportion to `opacities`."""
+        # In double, since float32 sums depend on the order in which torch adds.
+        weights = opacities.double().cpu()  # on the generator's device
         drawn = torch.multinomial(weights, count, replacement=True, generator=self.generator)
         return drawn.to(opacities.device)
 
     def _share_out(self, chosen: Tensor, opacities: Tensor) -> None:
-        """Give the Gaussians `chosen` [M] the opacity and scales that they share with copies.
+        """Set opacity and scales of Gaussians before they are copied (`share_out`).
 
         Args:
-            chosen: Indices, each as often as there will be copies of the Gaussian.
+            chosen: [M] indices; a Gaussian's index is repeated for each of its copies.
             opacities: [N] of all Gaussians.
         """
         gaussians = self.gaussians
@@ -179,7 +179,7 @@ class MCMCStrategy(Strategy):
         shares = activations.logistic(exponents)  # [N]
         moving = (shares > _LEAST_NOISE).nonzero()[:, 0]  # [M]
         # In double, since the numbers that torch draws in float32 depend on the processor. C e is
-        # R S^2 (R' e), and R' e is as normal as e: it is drawn along the axes of the Gaussian.
+        # R S^2 (R^T e), and R^T e has the distribution of e: so R^T e is drawn directly.
         normal = torch.randn(len(moving), 3, generator=self.generator, dtype=torch.float64)
         variances = activations.exp(gaussians.scales[moving]).square()  # [M, 3]
         noise = normal.to(variances) * variances * (shares[moving] * size)[:, None]
@@ -192,7 +192,7 @@ class MCMCStrategy(Strategy):
 
 
 def share_out(opacities: Tensor, shares: Tensor) -> tuple[Tensor, Tensor]:
-    """Find what n Gaussians at one place have to be to render nearly as one does.
+    """Return opacity and scale factor of n equal Gaussians that together render nearly as one.
 
     Equation 9 of 3DGS-MCMC [kheradmand2024]. A Gaussian of opacity o and scales s is replaced by n
     Gaussians with
@@ -206,7 +206,7 @@ def share_out(opacities: Tensor, shares: Tensor) -> tuple[Tensor, Tensor]:
 
     Args:
         opacities: [M] float64 in 0..1.
-        shares: [M] int64, n; at least 1.
+        shares: [M] int64, the number n of Gaussians, at least 1.
 
     Returns:
         o_n [M], and s_n / s [M].

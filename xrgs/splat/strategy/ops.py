@@ -1,4 +1,4 @@
-"""What strategies share: budgets, the choice of the highest scores, and splits."""
+"""Operations for strategies: budgets, the choice of the highest scores, and splits."""
 
 from __future__ import annotations
 
@@ -12,46 +12,45 @@ from torch import Tensor
 from xrgs.splat.quaternions import rotate, rotation_matrices
 
 SPLIT_SHRINK = 1.6
-"""The scales of a Gaussian split at random are divided by this in its two halves [kerbl2023,
-section 5.2]."""
+"""Random split: each half has the Gaussian's scales divided by this [kerbl2023, section 5.2]."""
 
 LONG_AXIS_OFFSET = 0.5
-"""Distance of a half from the Gaussian split along its longest axis, in scales of that axis."""
+"""Long-axis split: distance of each half's mean from the Gaussian's, in scales of that axis."""
 LONG_AXIS_SHRINK = 0.5
-"""Factor of the scale of the longest axis in a half."""
+"""Long-axis split: factor of the longest scale."""
 SHORT_AXES_SHRINK = 0.85
-"""Factor of the other two scales in a half."""
+"""Long-axis split: factor of the other two scales."""
 HALF_OPACITY = 0.6
-"""Factor of the opacity in a half."""
+"""Long-axis split: factor of the opacity."""
 
 
 @dataclass(frozen=True)
 class Budget:
-    """The largest number of Gaussians to which growth may lead, which rises during densification.
+    """A cap on the number of Gaussians, which rises during densification.
 
-    The growth control of ImprovedGS [deng2025]: at a share p of the steps from the start of
-    densification to its last refinement, the number is
+    The growth control of ImprovedGS [deng2025]: at a fraction p of the steps from the start of
+    densification to its last refinement, the cap is
 
         first + (most - first) * sqrt(p)
 
-    so that most Gaussians come early and have time to train. Our choice: the number starts at that
-    of the SfM points, where the authors' code has `most * sqrt(p)`. If there are more than `most`
-    points, nothing grows until pruning has left fewer.
+    so that most Gaussians are added early and have time to train. Our choice: the cap starts at the
+    number of SfM points, where the authors' code has `most * sqrt(p)`. If there are more than
+    `most` points, nothing grows until pruning has brought the number below `most`.
     """
 
     first: int
     """The number of Gaussians before training."""
     most: int
-    """The number of Gaussians at the end of densification."""
+    """The cap at the end of densification."""
 
     def cap(self, progress: float) -> int:
-        """Return the largest number of Gaussians at a share of densification in 0..1."""
+        """Return the cap at a fraction `progress` of densification, 0..1."""
         first = min(self.first, self.most)
         return first + int((self.most - first) * math.sqrt(progress))
 
 
 def gaussians_of(budget: float, view_pixels: int) -> int:
-    """Return the number of Gaussians of a budget, at least 1.
+    """Convert a budget per pixel to a number of Gaussians, at least 1.
 
     Args:
         budget: Gaussians per pixel.
@@ -61,7 +60,7 @@ def gaussians_of(budget: float, view_pixels: int) -> int:
 
 
 def top_k(candidates: Tensor, scores: Tensor, count: int) -> Tensor:
-    """Choose the candidates with the highest scores; of equal scores the first ones.
+    """Choose the candidates with the highest scores; ties go to the lower indices.
 
     ImprovedGS [deng2025] draws candidates with probabilities in proportion to their scores. Our
     choice: the highest scores, which needs no random numbers.
@@ -69,7 +68,7 @@ def top_k(candidates: Tensor, scores: Tensor, count: int) -> Tensor:
     Args:
         candidates: [N] bool.
         scores: [N] floats; a score that is infinite or NaN counts as 0.
-        count: How many to choose, at least 0; all candidates where there are fewer.
+        count: Number to choose, at least 0; all candidates if there are fewer.
 
     Returns:
         [N] bool, the chosen candidates.
@@ -85,7 +84,7 @@ def top_k(candidates: Tensor, scores: Tensor, count: int) -> Tensor:
 def split_at_random(
     old: Mapping[str, Tensor], scales: Tensor, generator: torch.Generator
 ) -> dict[str, Tensor]:
-    """Split each Gaussian into two smaller ones, with means drawn from it (gsplat's `split`).
+    """Split each Gaussian into two smaller ones with means drawn from it (gsplat's `split`).
 
     Args:
         old: Raw parameters [M, ...] for each name of `PARAMETERS`.
@@ -112,8 +111,8 @@ def split_along_longest_axis(old: Mapping[str, Tensor], scales: Tensor) -> dict[
 
         m +- 0.5 s_k R e_k,  s_k' = 0.5 s_k,  s_j' = 0.85 s_j for the others,  o' = 0.6 o.
 
-    Rotation and colour stay. In ImprovedGS's own code the halves are 1.35 s_k away, with scales of
-    0.55 and 0.89. Of equal scales the first is the longest.
+    Rotation and colour are kept. ImprovedGS's own code has an offset of 1.35 s_k and factors of
+    0.55 and 0.89 for the scales. Among equal scales the first counts as the longest.
 
     Args:
         old: Raw parameters [M, ...] for each name of `PARAMETERS`.

@@ -1,4 +1,4 @@
-"""What a strategy is told at a step, and what it reports."""
+"""The inputs of a strategy at a step (groups, hooks), and its result (`Refinement`)."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ if TYPE_CHECKING:
     from xrgs.splat.gaussians import Gaussians
 
 DECIDE = ("current_view", "per_class", "own_threshold")
-"""The values of `Groups.decide`."""
+"""Allowed values of `Groups.decide`."""
 
 _OPTIONAL = ("pruned_by_components", "relocated", "added")
 
 
 @dataclass(frozen=True)
 class Refinement:
-    """What a strategy did after a step; all counts are 0 at most steps.
+    """Counts of the Gaussians that a strategy changed after a step; 0 at most steps.
 
-    A removed Gaussian is counted once, by the first rule that holds in the order below. So the
-    number of Gaussians grows by exactly `duplicated + split + added - removed`.
+    A removed Gaussian is counted once, by the first rule below that applies. So the number of
+    Gaussians grows by exactly `duplicated + split + added - removed`.
     """
 
     duplicated: int = 0
@@ -32,33 +32,33 @@ class Refinement:
     """Gaussians with a high gradient that were replaced by two: the large ones, or with
     `split=long_axis` all that grow."""
     pruned_non_finite: int = 0
-    """Gaussians with a parameter, or the exponential of a scale, that was infinite or NaN."""
+    """Gaussians with a parameter or scale that was infinite or NaN."""
     pruned_opacity: int = 0
     """Gaussians with an opacity below the threshold."""
     pruned_scale: int = 0
-    """Gaussians that were too large, with an opacity that was high enough."""
+    """Gaussians that were too large; those with a low opacity are counted above."""
     pruned_by_components: int = 0
-    """Gaussians that components of training chose (`Component.to_prune`)."""
+    """Gaussians that training components pruned (`Component.to_prune`)."""
     reset: int = 0
     """Gaussians whose opacity was lowered to the cap."""
     relocated: int = 0
     """Transparent Gaussians that were moved to others (`MCMCStrategy`)."""
     added: int = 0
-    """Gaussians that were added at others (`MCMCStrategy`)."""
+    """Added copies of Gaussians (`MCMCStrategy`)."""
     by_group: Mapping[str, int] = field(default_factory=dict)
-    """Counts for each group of views, where there are groups. `grown_<group>`: Gaussians above the
-    group's growth threshold; one above the thresholds of two groups counts in both.
-    `pruned_opacity_<group>`: Gaussians below its opacity threshold."""
+    """Counts for each group of views, if there are groups. `grown_<group>`: Gaussians above the
+    group's growth threshold; a Gaussian above the thresholds of two groups counts in both.
+    `pruned_opacity_<group>`: Gaussians below the group's opacity threshold."""
 
     @property
     def removed(self) -> int:
-        """Number of pruned Gaussians, without the ones that a split replaced."""
+        """Number of pruned Gaussians, without those that a split replaced."""
         rules = self.pruned_non_finite + self.pruned_opacity + self.pruned_scale
         return rules + self.pruned_by_components
 
     def counts(self) -> dict[str, int]:
-        """Return the counts of the rules by their names, then the counts of the groups."""
-        # Some only where they are not 0: other runs have no column for them.
+        """Return name -> count, first of the rules, then of the groups."""
+        # Optional counts only if not 0: most runs need no column for them.
         rules = {
             name: value
             for name, value in vars(self).items()
@@ -69,7 +69,7 @@ class Refinement:
 
 @dataclass(frozen=True)
 class Thresholds:
-    """The two thresholds that may differ between groups of views."""
+    """The two thresholds that each group of views may have."""
 
     grow_grad2d: float
     """A Gaussian grows if its mean image-plane gradient is above this (`DensifySettings`)."""
@@ -79,19 +79,19 @@ class Thresholds:
 
 @dataclass(frozen=True)
 class Groups:
-    """Groups of views with thresholds of their own.
+    """Groups of views, each with its own thresholds.
 
-    `decide` says which thresholds hold at a refinement:
+    `decide` selects the thresholds at a refinement:
 
-    - `current_view`: all views add to one statistic, and the group of the view at whose step
-      Gaussians are refined sets both thresholds.
-    - `per_class`: each group has statistics of its own. A Gaussian grows where any group's mean
-      gradient is above that group's threshold. It is pruned by the threshold of the first group,
-      in the order given, with a view in which the Gaussian had an image-plane gradient since the
-      last refinement, or of the last group if there is no such view. (To be in a view's frustum is
-      not enough: in a forward-facing scene every Gaussian is in every frustum.)
-    - `own_threshold`: a Gaussian grows where the mean over all views of its gradient, each divided
-      by the threshold of the view's own group, is above 1. It is pruned as with `per_class`.
+    - `current_view`: all views share one statistic. Both thresholds are those of the group whose
+      view is trained at the step of the refinement.
+    - `per_class`: each group has its own statistics. A Gaussian grows if the mean gradient of any
+      group is above that group's threshold. The opacity threshold is that of the first group, in
+      the given order, with an image-plane gradient for the Gaussian since the last refinement, else
+      that of the last group. (Being inside a view's frustum does not count: in a forward-facing
+      scene every Gaussian is inside every frustum.)
+    - `own_threshold`: the gradients of each view are divided by the threshold of its group. A
+      Gaussian grows if their mean over all views is above 1. It is pruned as with `per_class`.
 
     Raises:
         ValueError: `decide` is none of these.
@@ -106,23 +106,23 @@ class Groups:
 
 
 def _nothing(gaussians: Gaussians) -> None:
-    """The answer of a hook that changes nothing."""
+    """A hook that changes nothing."""
     del gaussians
 
 
 @dataclass(frozen=True)
 class StrategyHooks:
-    """What components of training decide; a hook takes the N Gaussians, None changes nothing.
+    """Functions by which training components influence a strategy.
 
-    A strategy calls `may_grow` and `growth_scores` at refinements alone, before it changes
-    anything, and without gradients.
+    Each takes the N Gaussians; a result of None changes nothing. A strategy calls `may_grow` and
+    `growth_scores` only at refinements, before it changes anything, and without gradients.
     """
 
     may_grow: Callable[[Gaussians], Tensor | None] = _nothing
-    """Returns [N] bool, which of the Gaussians above the growth threshold may grow."""
+    """Returns [N] bool, whether the Gaussian may grow if it is above the growth threshold."""
     growth_scores: Callable[[Gaussians], Tensor | None] = _nothing
-    """Returns scores [N] of at least 0, by which the Gaussians that grow are chosen where a budget
-    leaves room for some of them; None stands for the mean image-plane gradient."""
+    """Returns scores [N], at least 0. If a budget has room for only some of the growing Gaussians,
+    those with the highest scores grow; None takes the mean image-plane gradient as the score."""
     opacity_attenuation: Callable[[Gaussians], Tensor | None] = _nothing
-    """Returns the factors [N] in 0..1 by which every render lowers the opacities. A reset caps the
-    lowered opacities; it comes after the step's refinement."""
+    """Returns factors [N] in 0..1 by which every render multiplies the opacities. A reset, which
+    comes after the step's refinement, caps the multiplied opacities."""

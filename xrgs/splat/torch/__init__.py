@@ -1,1 +1,1 @@
-"""The readable reference in torch, for any floating type, with gradients by autograd."""
+"""The readable reference implementation in torch, for any floating type, with autograd."""

@@ -24,6 +24,6 @@ def activate(scales: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def activated(raw: ActivatedGaussians) -> ActivatedGaussians:
-    """Return Gaussians whose scales and opacities were natural logarithms and logits."""
+    """Apply the activation functions to raw Gaussians (log scales, logit opacities)."""
     scales, opacities = activate(raw.scales, raw.opacities)
     return raw._replace(scales=scales, opacities=opacities)

@@ -13,16 +13,16 @@ def accumulate_statistics(
     grad2d_sum: Tensor,
     visible_count: Tensor,
 ) -> None:
-    """Add the image-plane gradients of a step to the sums that densification decides by.
+    """Add a step's image-plane gradients to the statistics for densification, in place.
 
     gsplat's `DefaultStrategy._update_state` (`strategy/default.py`).
 
     Args:
-        means2d_grad: [N, 2] gradient of the loss by the projected means, per px.
-        visible: [N] bool; Gaussians that are not visible add nothing, whatever their gradient.
+        means2d_grad: [N, 2] gradient of the loss with respect to the projected means, per px.
+        visible: [N] bool; gradients of Gaussians that are not visible are ignored.
         half_size: Half the view's width and height, px: the factors to normalised device units.
-        grad2d_sum: [N] to which the gradients' norms are added in place.
-        visible_count: [N] to which 1 is added in place where visible.
+        grad2d_sum: [N] sum of the norms of the gradients, which is increased.
+        visible_count: [N] number of views that showed the Gaussian, which is increased.
     """
     scaled = means2d_grad * means2d_grad.new_tensor(half_size)  # [N, 2]
     grad2d_sum += torch.where(visible, scaled.norm(dim=-1), 0)

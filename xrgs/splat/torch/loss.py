@@ -7,16 +7,16 @@ from torch import Tensor
 
 from xrgs.splat.ssim import C1, C2, WINDOW, Target, window_mean, window_moments
 
-#: Rows of windows whose moments are computed at once. At 1,008 px they stay in the processor's
-#: cache, and the moments take a tenth of the time of all rows at once.
+#: Rows of windows that `target_moments` computes at once. At 1,008 px these fit in the processor's
+#: cache, which takes a tenth of the time of all rows at once.
 _ROWS = 32
 
 
 def target_moments(image: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the mean and the variance of a photograph under the window (`Target`).
+    """Return the mean and the variance of a photograph in each SSIM window (`Target`).
 
     Args:
-        image: [H, W, 3], of any floating type, contiguous, without a graph.
+        image: [H, W, 3], of any floating type, contiguous, detached from autograd.
 
     Returns:
         Mean and variance, [H - 10, W - 10, 3] each, of the image's type.
@@ -34,18 +34,7 @@ def target_moments(image: Tensor) -> tuple[Tensor, Tensor]:
 def photometric_loss(
     image: Tensor, target: Target, l1: float, ssim: float, pixel_weight: Tensor | None
 ) -> Tensor:
-    """Return `xrgs.splat.loss.photometric_loss`; its checks have passed.
-
-    Args:
-        image: [H, W, 3] render, of any floating type and strides.
-        target: The photograph, of the same shape and type.
-        l1: Weight of the absolute difference.
-        ssim: Weight of the structural dissimilarity.
-        pixel_weight: [H, W]; None weighs all pixels 1.
-
-    Returns:
-        A scalar.
-    """
+    """Compute `xrgs.splat.loss.photometric_loss` of checked arguments, in any floating type."""
     difference = (image - target.image).abs()  # [H, W, 3]
     dissimilarity = dissimilarity_map(image, target)  # [H - 10, W - 10, 3]
     if pixel_weight is not None:
@@ -58,12 +47,12 @@ def photometric_loss(
 def dissimilarity_map(image: Tensor, target: Target) -> Tensor:
     """Return 1 - SSIM of every window that lies inside the image [wang2004, equation 13].
 
-    The data range is 1, and no window is padded: what gsplat's trainer calls as
-    `fused_ssim(padding="valid")`.
+    The data range is 1, and windows are not padded: `fused_ssim(padding="valid")` of gsplat's
+    trainer.
 
-    SSIM is luminance times structure. Where the image is almost its target both are almost 1, and
-    in float32 their difference from 1 would be rounding. So that nothing cancels, the differences
-    are computed from the moments of d = x - t, the difference of image and target:
+    SSIM is luminance times structure. If the image nearly equals its target, both are nearly 1, and
+    1 minus either would be only rounding error in float32. So 1 - luminance and 1 - structure are
+    computed without cancellation, from the moments of d = x - t, image minus target:
 
         1 - luminance = E[d]^2 / (mean_x^2 + mean_t^2 + C1)
         1 - structure = var_d / (var_x + var_t + C2), where var_x = var_t + 2 cov(t, d) + var_d
@@ -74,7 +63,7 @@ def dissimilarity_map(image: Tensor, target: Target) -> Tensor:
         target: The photograph, of the same shape and type.
 
     Returns:
-        [H - 10, W - 10, 3], one value for each window, in 0..2 but for rounding.
+        [H - 10, W - 10, 3], one value for each window, in 0..2 up to rounding.
     """
     difference = image - target.image
     products = torch.cat(
@@ -82,7 +71,8 @@ def dissimilarity_map(image: Tensor, target: Target) -> Tensor:
     )  # [H, W, 9]
     mean, square, product = window_mean(products).chunk(3, dim=-1)  # [H - 10, W - 10, 3] each
     covariance = product - target.mean * mean
-    # Rounding makes the variance of a flat image negative, and far outside 0..1 below -C2.
+    # Rounding can make the variance of a flat image negative, for values far outside 0..1 even
+    # below -C2.
     variance = (square - mean * mean).clamp_min(0)
     image_variance = (target.variance + 2 * covariance + variance).clamp_min(0)
     image_mean = target.mean + mean

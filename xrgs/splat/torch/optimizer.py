@@ -18,13 +18,13 @@ if TYPE_CHECKING:
 
 @torch.no_grad()
 def step(optimizer: SplatOptimizer, camera: Camera | None = None, sh_degree: int = 0) -> None:
-    """Move every parameter that has a gradient.
+    """Update every parameter that has a gradient, and Adam's state of it (`SplatOptimizer.step`).
 
     Args:
-        optimizer: The parameters with their gradients, and Adam's state of them, which is updated.
-        camera: The view that the gradients come from; None leaves shN as it is, unless it has a
-            gradient (`SplatOptimizer.step`).
-        sh_degree: Highest band of the spherical harmonics that was rendered.
+        optimizer: The parameters with their gradients and Adam states.
+        camera: The rendered view that the gradients come from. None leaves shN as it is, unless shN
+            has a gradient.
+        sh_degree: Highest rendered band of the spherical harmonics.
     """
     if camera is not None:
         _fill_harmonics_gradient(optimizer, camera, sh_degree)
@@ -52,7 +52,7 @@ def step(optimizer: SplatOptimizer, camera: Camera | None = None, sh_degree: int
 
 
 def _fill_harmonics_gradient(optimizer: SplatOptimizer, camera: Camera, sh_degree: int) -> None:
-    """Give shN the gradient that sh0's implies; nothing where sh0 has none."""
+    """Set the gradient of shN from that of sh0, if sh0 has one."""
     means, sh0, shN = (optimizer.gaussians[name] for name in ("means", "sh0", "shN"))
     if sh0.grad is not None:
         dirs = normalize(means - camera.position.to(means), dim=-1)  # [N, 3]

@@ -1,8 +1,8 @@
 """Projection of Gaussians to ellipses on the image plane, and culling.
 
 Elliptical weighted averaging [zwicker2001], as in 3D Gaussian Splatting [kerbl2023, section 4,
-equations 5 and 6] and in gsplat 1.5 (`_fully_fused_projection` of `cuda/_torch_impl.py`). The one
-difference: the determinant and the quadratic form are written so that nothing cancels in float32.
+equations 5 and 6] and in gsplat 1.5 (`_fully_fused_projection` of `cuda/_torch_impl.py`). Only the
+formulas of the determinant and the quadratic form differ, to avoid cancellation in float32.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from xrgs.splat.quaternions import rotation_matrices
 from xrgs.splat.settings import RasterSettings
 
 CLAMP_MARGIN = 0.3
-"""Share of half the field of view by which the point of the Jacobian may lie outside the image
-(gsplat: within 1.3 tan(fov / 2))."""
+"""How far outside the image the Jacobian's point may lie, as a fraction of half the field of view
+(gsplat clamps to 1.3 tan(fov / 2))."""
 
 LARGEST = 1e18
-"""Half a side of the largest bounding box of a Gaussian that is rendered, px."""
+"""Limit of half a side of a Gaussian's bounding box, px."""
 
 
 class ProjectedGaussians(NamedTuple):
@@ -29,13 +29,13 @@ class ProjectedGaussians(NamedTuple):
 
     means2d: Tensor  # [M, 2] px
     cov: Tensor  # [M, 3] xx, xy, yy of the dilated covariance, px^2
-    det: Tensor  # [M] determinants of these covariances, px^4; float64 where float32 overflows
+    det: Tensor  # [M] determinants of these covariances, px^4; float64 if float32 overflows
     opacities: Tensor  # [M], compensated for the dilation if antialiased
     depths: Tensor  # [M] world units
 
 
 def depths(means: Tensor, camera: Camera) -> Tensor:
-    """Return the distance of Gaussians along the camera's optical axis.
+    """Return the depths of Gaussians: their distances along the camera's optical axis.
 
     Args:
         means: [N, 3] world units.
@@ -56,12 +56,12 @@ def project(
     camera: Camera,
     settings: RasterSettings,
 ) -> ProjectedGaussians:
-    """Project Gaussians in front of the camera, their covariances through the local Jacobian.
+    """Project Gaussians in front of the camera to ellipses on the image plane.
 
     With M = J W R S (equations 5 and 6 of 3D Gaussian Splatting), a [2, 3] matrix, the covariance
     on the image plane is M M^T + eps2d I. With `settings.antialiased` the opacity is multiplied by
-    sqrt(det(M M^T) / det(M M^T + eps2d I)), the 2D Mip filter of Mip-Splatting [yu2024] as
-    gsplat has it (`calc_compensations`).
+    sqrt(det(M M^T) / det(M M^T + eps2d I)), the 2D Mip filter of Mip-Splatting [yu2024] as in
+    gsplat (`calc_compensations`).
 
     Args:
         means: [M, 3] world units, all in front of the near plane.
@@ -79,7 +79,7 @@ def project(
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     means2d = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=-1)  # [M, 2]
 
-    # Far outside the image the affine approximation blows up: hold its point at the border.
+    # Far outside the image the affine approximation diverges: clamp its point near the border.
     tan_x = _clamp_tangent(x / z, cx / fx, (camera.width - cx) / fx)  # [M]
     tan_y = _clamp_tangent(y / z, cy / fy, (camera.height - cy) / fy)
     # W R S: the Gaussian's axes in camera coordinates.
@@ -90,9 +90,9 @@ def project(
     eps = settings.eps2d
     xx, xy, yy = (row_x * row_x).sum(-1), (row_x * row_y).sum(-1), (row_y * row_y).sum(-1)  # [M]
     area, det = _area_and_determinant(row_x, row_y, eps)
-    if not torch.isfinite(det).all():  # of a Gaussian larger than 4e9 px, in float32
+    if not torch.isfinite(det).all():  # float32 overflows for a Gaussian larger than 4e9 px
         area, det = _area_and_determinant(row_x.double(), row_y.double(), eps)
-        overflows = ~torch.isfinite(det)  # `visible_by_depth` refuses these, if they are drawn
+        overflows = ~torch.isfinite(det)  # `visible_by_depth` refuses visible ones
         area, det = area.masked_fill(overflows, 1.0), det.masked_fill(overflows, 1.0)
     if settings.antialiased:
         opacities = (opacities * area / det.sqrt()).to(opacities)
@@ -103,7 +103,7 @@ def project(
 def _area_and_determinant(row_x: Tensor, row_y: Tensor, eps: float) -> tuple[Tensor, Tensor]:
     """Return sqrt(det(M M^T)) and det(M M^T + eps I), for the rows of M.
 
-    It is expanded so that nothing cancels: xx yy - xy^2 does in float32.
+    The formula avoids xx yy - xy^2, which cancels in float32.
     """
     xx, yy = (row_x * row_x).sum(-1), (row_y * row_y).sum(-1)  # [M]
     area = torch.linalg.vector_norm(torch.linalg.cross(row_x, row_y), dim=-1)
@@ -111,7 +111,7 @@ def _area_and_determinant(row_x: Tensor, row_y: Tensor, eps: float) -> tuple[Ten
 
 
 def _clamp_tangent(tangent: Tensor, before: Tensor, after: Tensor) -> Tensor:
-    """Hold x/z within the image, whose borders are at -before and after, and a margin."""
+    """Clamp x/z to the image, whose borders are at -before and after, plus a margin."""
     margin = CLAMP_MARGIN * 0.5 * (before + after)
     return torch.minimum(torch.maximum(tangent, -before - margin), after + margin)
 
@@ -126,9 +126,9 @@ def cutoff_radius_sq(opacities: Tensor, settings: RasterSettings) -> Tensor:
         settings: `alpha_min` is read.
 
     Returns:
-        [M] float64, negative where the opacity itself is below alpha_min.
+        [M] float64, negative if the opacity is below alpha_min.
     """
-    # With an alpha_min of 0 the radius ends where float64 has no normal numbers left.
+    # For an alpha_min of 0 the radius ends at the smallest normal float64.
     smallest = max(settings.alpha_min, torch.finfo(torch.float64).tiny)
     return 2 * torch.log(opacities.double() / smallest)
 
@@ -144,7 +144,7 @@ def visible_by_depth(
         settings: `alpha_min` is read.
 
     Returns:
-        [M] indices, front to back; equal depths keep the order of their indices.
+        [M] indices, front to back; equal depths in ascending order.
 
     Raises:
         ValueError: A Gaussian is larger than `LARGEST`.
@@ -157,7 +157,7 @@ def visible_by_depth(
     is_drawn = (radius_sq >= 0) & torch.isfinite(projected.means2d).all(-1)
     if not (extent[is_drawn] < LARGEST).all():
         raise ValueError(f"scales: a Gaussian is larger than {LARGEST:.0e} px in the image")
-    # A covariance that is singular for want of dilation has no inverse.
+    # Without dilation a covariance may be singular, and has no inverse then.
     visible = is_drawn & (projected.det > 0) & ((high > 0) & (low < size)).all(-1)  # [N]
     order = torch.argsort(projected.depths, stable=True)
     return order[visible[order]]
@@ -166,8 +166,8 @@ def visible_by_depth(
 def conic_cholesky(projected: ProjectedGaussians) -> Tensor:
     """Return the Cholesky factor of half the conic (the inverse covariance) of each Gaussian.
 
-    The factor [[c_xx, c_xy], [0, c_yy]] makes the exponent a sum of squares: with d a pixel's
-    centre less the mean, u = c_xx dx + c_xy dy and v = c_yy dy, alpha = opacity exp(-u^2 - v^2).
+    The factor [[c_xx, c_xy], [0, c_yy]] makes the exponent a sum of squares. For d, a pixel's
+    centre minus the mean, u = c_xx dx + c_xy dy and v = c_yy dy: alpha = opacity exp(-u^2 - v^2).
 
     Args:
         projected: M Gaussians with invertible covariances.

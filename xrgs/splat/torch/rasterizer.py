@@ -1,10 +1,10 @@
 """The reference rasterizer: 3D Gaussian Splatting in plain torch, with gradients by autograd.
 
-The native rasterizer is tested against it, so it runs in any floating type. It composites as
-gsplat's CUDA kernels do.
+It composites as gsplat's CUDA kernels do. The native rasterizer is tested against it, so it runs in
+any floating type.
 
 A render finds the visible Gaussians, front to back; projects them; lists for every tile the
-Gaussians that reach it; and composites tiles in padded batches of similar list length.
+Gaussians that reach it; and composites the tiles in batches, each with lists padded to one length.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ from xrgs.splat.torch.projection import (
 from xrgs.splat.torch.tiles import TileBatch, TileGrid, build_tile_batches, intersect_tiles
 
 TILE = 8
-"""Side of a tile, px. Any gives the same image; 8 was the fastest of 4, 8 and 16 in torch."""
+"""Side of a tile, px. The image does not depend on it; 8 is the fastest of 4, 8 and 16 in torch."""
 
 BATCH_ELEMENTS = 1 << 18
-"""Alpha values in a batch of tiles: 1 MB in float32, so that a pass stays in the cache."""
+"""Number of alpha values in a batch of tiles: 1 MB in float32, which fits in the cache."""
 
 _LOG_OPACITY = 5
 """Column of the log opacity among the attributes of a Gaussian."""
@@ -65,7 +65,7 @@ def render(
 
     Raises:
         ValueError: A parameter has values that are not finite or out of range.
-        MemoryError: There are more (tile, Gaussian) pairs than fit in memory.
+        MemoryError: The (tile, Gaussian) pairs do not fit in memory.
     """
     if raw:
         gaussians = activated(gaussians)
@@ -118,12 +118,12 @@ def _project_visible(
     """Project the visible Gaussians, front to back.
 
     Returns:
-        Their indices [M], the projected Gaussians, and the attributes that compositing reads:
-        [M, 9] x, y, the Cholesky factor of the conic, log opacity, colour; with absgrad [M, 11]:
-        the offset, of value zero, comes last.
+        Their indices [M], the projected Gaussians, and the attributes for compositing: [M, 9] x, y,
+        the Cholesky factor of the conic, log opacity, colour; with absgrad [M, 11], since an offset
+        of value zero comes last.
     """
     means, quats, scales, opacities, sh0, shN = gaussians
-    # With absgrad the means hold the offset's value, and pixels its gradient: see `_PixelOffset`.
+    # With absgrad the means get the offset's value without its gradient: see `_PixelOffset`.
     mean_offset = means2d_offset.detach() if settings.absgrad else means2d_offset
 
     def project_some(ids: Tensor) -> ProjectedGaussians:
@@ -134,8 +134,8 @@ def _project_visible(
     with torch.no_grad():
         in_front = torch.nonzero(depths(means, camera) > settings.near)[:, 0]
         ids = in_front[visible_by_depth(project_some(in_front), camera, settings)]  # [M]
-    # Projected again, not masked: a Gaussian that is behind the camera or overflows must stay out
-    # of the graph, where its gradient would be 0 * inf.
+    # Projected again instead of masked, so that Gaussians behind the camera or with an overflow are
+    # not in the graph, where their gradient would be 0 * inf.
     projected = project_some(ids)
     dirs = normalize(means[ids] - camera.position.to(means), dim=-1)  # [M, 3]
     colors = sh_to_colors(sh_degree, dirs, sh0[ids], shN[ids])  # [M, 3]
@@ -153,7 +153,7 @@ def _composite_batches(
     grid: TileGrid,
     settings: RasterSettings,
 ) -> tuple[Tensor, int]:
-    """Composite every tile: [tiles, tile^2, 4], numbered row by row, and the bytes that took."""
+    """Composite every tile: [tiles, tile^2, 4], row by row, and the memory used, bytes."""
     padding = attributes.new_zeros((1, attributes.shape[1]))
     padding[:, _LOG_OPACITY] = float("-inf")
     listed = embedding(lists, torch.cat([attributes, padding]))  # [sum of B K, 9 or 11]
@@ -161,7 +161,7 @@ def _composite_batches(
     outputs = []
     for batch, flat_entries in zip(batches, by_batch, strict=True):
         entries = flat_entries.reshape(len(batch.tiles), batch.longest, -1)  # [B, K, 9 or 11]
-        # Recomputed in the backward pass: a view's alphas at once would not fit in memory.
+        # Recomputed in the backward pass: all alphas of a view would not fit in memory.
         rgba = checkpoint(
             composite,
             entries,
@@ -181,22 +181,22 @@ def _composite_batches(
 
 
 def alpha_bytes(itemsize: int, *, absgrad: bool = False) -> int:
-    """Return the bytes that `composite` keeps for backward, for each pixel and Gaussian of a batch.
+    """Return the bytes that `composite` saves for backward per pair of a pixel and a Gaussian.
 
     Args:
-        itemsize: Bytes of one number of the floating type.
-        absgrad: Whether pixels have offsets of their own.
+        itemsize: Size of a number of the floating type, bytes.
+        absgrad: Whether `RasterSettings.absgrad` is on.
     """
-    # u, the exponential, alpha, 1 - alpha, the transmittances before and behind, weights, and two
-    # masks; with absgrad also v and the two coordinates of the offset.
+    # u, exponential, alpha, 1 - alpha, transmittance before and behind, weights, and two masks;
+    # with absgrad also v and the two coordinates of the offset.
     return (10 if absgrad else 7) * itemsize + 2
 
 
 class _PixelOffset(torch.autograd.Function):
-    """An offset [B, K, 2] expanded to every pixel of a tile: x and y, [B, K, tile, tile] each.
+    """Expand an offset [B, K, 2] to every pixel of a tile: x and y, [B, K, tile, tile] each.
 
-    The gradient of the offset is the sum of the absolute values of its pixels' gradients: the
-    homodirectional gradient of AbsGS [ye2024absgs], gsplat's `absgrad`.
+    The backward pass sums the absolute values of the pixels' gradients: the homodirectional
+    gradient of AbsGS [ye2024absgs], gsplat's `absgrad`.
     """
 
     @staticmethod
@@ -212,16 +212,17 @@ class _PixelOffset(torch.autograd.Function):
 def composite(entries: Tensor, corner: Tensor, tile: int, settings: RasterSettings) -> Tensor:
     """Composite tiles front to back (3D Gaussian Splatting, section 4, equation 3).
 
-    A contribution below alpha_min is skipped, one above alpha_max is capped (no gradient), and a
-    pixel ends before the Gaussian that would leave it a transmittance of transmittance_min or less.
+    An alpha below alpha_min is skipped, an alpha above alpha_max is capped (without gradient), and
+    a pixel ends before the Gaussian that would reduce its transmittance to transmittance_min or
+    less.
 
     Args:
         entries: [B, K, 9] attributes of each tile's Gaussians, front to back: x, y, the Cholesky
-            factor of the conic, log opacity, colour; with absgrad [B, K, 11]: the offset, of value
-            zero, comes last.
+            factor of the conic, log opacity, colour; with absgrad [B, K, 11], since an offset of
+            value zero comes last.
         corner: [B, 2] top left corner of each tile, px.
         tile: Side of a tile, px.
-        settings: The cut-offs.
+        settings: The three limits above and `absgrad` are read.
 
     Returns:
         [B, tile^2, 4] colour without background, and alpha.
@@ -241,7 +242,7 @@ def composite(entries: Tensor, corner: Tensor, tile: int, settings: RasterSettin
     alpha = alpha.flatten(2)  # [B, K, tile^2]
     alpha = torch.where(alpha < settings.alpha_min, 0.0, alpha)
 
-    # The product only falls, so the composited Gaussians are exactly a prefix of the list.
+    # Transmittance never rises, so the composited Gaussians are a prefix of the list.
     behind = torch.cumprod(1 - alpha, dim=1)  # [B, K, tile^2] transmittance behind each
     before = torch.cat([torch.ones_like(behind[:, :1]), behind[:, :-1]], dim=1)
     weights = torch.where(behind > settings.transmittance_min, alpha * before, 0.0)

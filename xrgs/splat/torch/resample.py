@@ -1,4 +1,4 @@
-"""Image resampling as a product with one matrix an axis."""
+"""Image resampling as a product with one matrix for each axis."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ def resize(image: Tensor, height: int, width: int, variances: Tensor | None = No
 
 
 def _blur(resampled: Tensor, variance: Tensor) -> Tensor:
-    """The blur [size, size] of an axis that a matrix [., size] resamples.
+    """Return the blur matrix [size, size] of the axis that `resampled` [., size] resamples.
 
-    A blur of the discrete analogue of the Gaussian is the exponential of half the second difference
-    [lindeberg1990], whose eigenvectors are cosines where the borders reflect.
+    The discrete analogue of a Gaussian blur is the matrix exponential of half the variance times
+    the second difference [lindeberg1990]. With reflected borders its eigenvectors are cosines.
     """
     size = resampled.shape[1]
     frequencies = torch.arange(size, dtype=torch.float64) * (math.pi / size)
@@ -35,7 +35,7 @@ def _blur(resampled: Tensor, variance: Tensor) -> Tensor:
 
 @cache
 def _cosines(size: int) -> Tensor:
-    """The orthonormal discrete cosine transform [frequencies, samples], float64."""
+    """Return the orthonormal discrete cosine transform [frequencies, samples], float64."""
     frequency, sample = torch.meshgrid(*2 * [torch.arange(size).double()], indexing="ij")
     waves = torch.cos(math.pi / size * frequency * (sample + 0.5)) * math.sqrt(2 / size)
     return torch.where(frequency == 0, math.sqrt(1 / size), waves)

@@ -1,7 +1,7 @@
-"""The Gaussians that each tile of the image composites, and tiles grouped into batches.
+"""Lists of the Gaussians in each tile of the image, and batches of tiles.
 
 The tiles of 3D Gaussian Splatting [kerbl2023, section 6] (gsplat's `_isect_tiles`). gsplat lists
-every tile that a bounding box overlaps; here the lists follow the ellipse in each row of tiles.
+every tile that the bounding box of a Gaussian overlaps; here only those that its ellipse overlaps.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from xrgs.splat.settings import RasterSettings
 from xrgs.splat.torch.projection import ProjectedGaussians, cutoff_radius_sq
 
 MAX_PAIRS = 1 << 27
-"""Largest number of (tile, Gaussian) pairs: at some 80 bytes each, 10 GB."""
+"""Largest number of (tile, Gaussian) pairs in a view: 10 GB, at about 80 bytes each."""
 
 RADIUS_MARGIN = 0.01
 """Added to the squared cutoff radius (in standard deviations), so that rounding drops no pixel."""
@@ -41,15 +41,15 @@ class TileGrid:
         return -(-self.height // self.tile)
 
     def span(self, first: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the columns (or rows) of tiles that ranges of pixels fall into.
+        """Convert ranges of pixels to ranges of tile columns (or rows).
 
         Args:
             first: [R] first pixel of each range.
-            last: [R] last pixel of each range; below the first where the range is empty.
+            last: [R] last pixel of each range; below `first` if the range is empty.
 
         Returns:
-            First and last column (or row), [R] each; the last is below the first where the range
-            is empty.
+            First and last column (or row), [R] each; the last is below the first if the range is
+            empty.
         """
         begin = torch.div(first, self.tile, rounding_mode="floor")
         end = torch.div(last, self.tile, rounding_mode="floor")
@@ -62,19 +62,19 @@ class TileGrid:
 
 @dataclass(frozen=True)
 class TileBatch:
-    """Tiles that are composited together, every list padded to the longest."""
+    """Tiles that are composited together, with lists padded to the longest one."""
 
-    tiles: Tensor  # [B]
-    longest: int  # K
+    tiles: Tensor  # [B] numbers of the tiles
+    longest: int  # K, length of the lists
 
 
 def intersect_tiles(
     projected: ProjectedGaussians, grid: TileGrid, settings: RasterSettings
 ) -> tuple[Tensor, Tensor]:
-    """Return every (tile, Gaussian) pair in which some pixel's alpha reaches alpha_min.
+    """List the (tile, Gaussian) pairs in which the alpha of a pixel reaches alpha_min.
 
-    The pairs are a superset, exact but for a margin: the ellipse's horizontal extent is found for
-    each row of tiles.
+    A few more pairs are listed, because of `RADIUS_MARGIN`. The ellipse's horizontal extent is
+    computed for each row of tiles.
 
     Args:
         projected: Visible Gaussians, front to back.
@@ -97,15 +97,15 @@ def intersect_tiles(
     # [R], one entry for each pair of a Gaussian and a row of tiles.
     gaussian, tile_row = _expand_ranges(*grid.span(top, bottom))
 
-    # The extent in a row of tiles ends at the ellipse's leftmost and rightmost points or, where
-    # these are outside the row, at the row's border next to them: the boundary is concave.
+    # The ellipse is convex: its extent in a row of tiles ends at its leftmost and rightmost points
+    # or, if these are outside the row, at the row's border next to them.
     top_dy = torch.maximum(tile_row * grid.tile, top[gaussian]) + 0.5 - y[gaussian]
     last_row = tile_row * grid.tile + grid.tile - 1
     bottom_dy = torch.minimum(last_row, bottom[gaussian]) + 0.5 - y[gaussian]
     dy_at_xmax = ((radius_sq / xx).sqrt() * xy)[gaussian]
     right_dy = torch.minimum(torch.maximum(dy_at_xmax, top_dy), bottom_dy)
     left_dy = torch.minimum(torch.maximum(-dy_at_xmax, top_dy), bottom_dy)
-    # At a height dy the ellipse is centred at slope dy, and this wide to either side of it.
+    # At height dy the ellipse is centred at slope * dy; its half width follows from `variance`.
     slope, variance = (xy / yy)[gaussian], (projected.det.double() / yy)[gaussian]
     radius_sq, yy = radius_sq[gaussian], yy[gaussian]
     left_width = (variance * (radius_sq - left_dy * left_dy / yy).clamp_min(0)).sqrt()
@@ -137,8 +137,8 @@ def _expand_ranges(first: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
     """Return all integers of the ranges first..last (inclusive; may be empty).
 
     Returns:
-        The index of the range that each integer is of, and the integer: both [sum of lengths], in
-        the order of the ranges and ascending within each.
+        Index of the range of each integer, and the integer: both [sum of lengths], in the order of
+        the ranges and ascending within each.
     """
     lengths = (last - first + 1).clamp_min(0)
     index = torch.repeat_interleave(lengths)
@@ -149,17 +149,17 @@ def _expand_ranges(first: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
 def build_tile_batches(
     tile: Tensor, gaussian: Tensor, grid: TileGrid, padding: int, elements: int
 ) -> tuple[list[TileBatch], Tensor]:
-    """Group all tiles by the length of their lists, longest first, and pad the lists.
+    """Group all tiles into batches by the length of their lists, longest first; pad the lists.
 
     Args:
         tile: [P] tiles of the pairs, ascending.
         gaussian: [P] Gaussians of the pairs.
-        grid: The tiles of the image; those with an empty list are grouped too.
-        padding: The index that lists are padded with.
-        elements: Number of alpha values that a batch may have, unless one tile alone has more.
+        grid: The tiles of the image; tiles with an empty list are grouped too.
+        padding: Gaussian index with which the lists are padded.
+        elements: Largest number of alpha values in a batch; a batch of one tile may have more.
 
     Returns:
-        The batches, and the padded lists of all, one batch after another: [sum of B K].
+        The batches, and their padded lists one after another: [sum of B K].
     """
     tiles = grid.columns * grid.rows
     counts = torch.bincount(tile, minlength=tiles)  # [tiles]

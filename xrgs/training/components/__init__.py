@@ -1,11 +1,10 @@
 """The components of XR-GS [xrgs], and the hooks by which training calls them.
 
-A component that is off is not even imported, so that the baseline executes none of its code. What
-the paper leaves open is fixed in the docstrings of the components, under "our choice where the
-paper is silent".
+A component that is off is not imported, so the baseline executes none of its code. The docstrings
+of the components list what the paper leaves open, under "our choice where the paper is silent".
 
-`xrgs.registry` lists the components. A component of another package is not in it:
-`xrgs.plugins` finds it by its entry point. CONTRIBUTING.md says how to write either kind.
+`xrgs.registry` lists the built-in components; `xrgs.plugins` finds those of other packages by their
+entry points. docs/add_component.md says how to write either kind.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ __all__ = [
 def build(
     conf: ComponentsConf, data: Dataset, splat: SplatConf, backend: str = "torch", seed: int = 0
 ) -> Components:
-    """Build the components that a config switches on.
+    """Build the components that are on in a config.
 
     Args:
         conf: `components` of the config.
@@ -58,11 +57,11 @@ def build(
         seed: `seed` of the config.
 
     Returns:
-        The built-in components that are on, then other packages' components by their names.
+        The built-in components that are on, then those of other packages in order of their names.
 
     Raises:
-        XrgsError: A value is out of its range, a view is too small for its paired target, a
-            component has no view or weight to act on, or a plugin cannot be used.
+        XrgsError: A value is out of range, a view is too small for its paired image, a component
+            has no view or weight to act on, or a plugin cannot be used.
     """
     setup = TrainingSetup(conf, data, splat, backend, seed)
     built = [
@@ -81,7 +80,7 @@ def _import(entry: ComponentEntry) -> type[Component]:
 
 
 def _build_plugin(name: str, values: Mapping[str, Any], setup: TrainingSetup) -> Component | None:
-    """The component of another package, built from its values in the config; None where off."""
+    """Build the component of another package from its values in the config; None if it is off."""
     key = f"components.plugins.{name}"
     kind = plugins.load(name)
     if not (isinstance(kind, type) and issubclass(kind, Component)):
@@ -98,5 +97,5 @@ def _build_plugin(name: str, values: Mapping[str, Any], setup: TrainingSetup) ->
         return kind.from_settings(settings, setup)
     except XrgsError:
         raise
-    except Exception as error:  # any error of another package's code must name its key
+    except Exception as error:  # another package may raise any error; the message names its key
         raise XrgsError(f"{key}: {type(error).__name__}: {error}") from error

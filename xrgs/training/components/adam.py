@@ -1,4 +1,4 @@
-"""Adam for what components learn beside the Gaussians, a row a step."""
+"""Adam for parameters that components learn for each view, one row at each step."""
 
 from __future__ import annotations
 
@@ -9,28 +9,27 @@ import torch
 from torch import Tensor
 
 _BETA1, _BETA2, _EPS = 0.9, 0.999, 1e-8
-"""The decay rates, and the term in the denominator: torch's defaults."""
+"""The decay rates, and the constant in the denominator: torch's defaults."""
 _STATE = ("values", "first", "second", "updates")
 
 
 class RowAdam:
-    """Moves one row of a tensor at a time by Adam [kingma2015], as if each row had its own.
+    """Adam [kingma2015] with its own moments and step count for each row of a tensor.
 
     Attributes:
-        values: The rows [R, ...], float64: the last digits of an update must not depend on the
-            processor.
+        values: The rows [R, ...], in float64, so that updates do not depend on the processor.
     """
 
     def __init__(self, values: Tensor) -> None:
-        """Start with these rows [R, ...], which are copied."""
+        """Start with a copy of the rows [R, ...]."""
         self.values = values.double().clone()
         self.first, self.second = torch.zeros_like(self.values), torch.zeros_like(self.values)
-        """The moments of the gradients [R, ...]."""
+        """First and second moments of the gradients [R, ...]."""
         self.updates = torch.zeros(len(values), dtype=torch.int64)
-        """The number of updates of each row [R]."""
+        """Number of updates of each row [R]."""
 
     def update(self, at: int, gradient: Tensor, rate: float) -> None:
-        """Move a row against its gradient [...], float64."""
+        """Update row `at` by its gradient [...], float64."""
         self.updates[at] += 1
         count = int(self.updates[at])
         first, second = self.first[at], self.second[at]
@@ -40,10 +39,10 @@ class RowAdam:
         self.values[at] -= rate / (1 - _BETA1**count) * first / spread
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the rows, their moments, and the numbers of updates."""
+        """Return the rows, their moments and their numbers of updates."""
         return {name: getattr(self, name) for name in _STATE}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore what `state_dict` returned."""
+        """Restore a state of `state_dict`."""
         for name in _STATE:
             getattr(self, name).copy_(state[name])

@@ -4,28 +4,28 @@ Before the first step training calls `densification_groups`, `before_training` a
 `on_gaussians_changed`. Then every step calls these hooks of each component that is on, in this
 order:
 
-1. `allows_view`: may the sampler choose this view?
-2. `training_views`: the cameras and photographs of this step,
-3. `render_camera`: the camera of the render,
-4. `before_render`: the Gaussians of the render, which follows,
-5. `to_photograph`: the render at the size of the photograph,
-6. `match_colors`: its colours,
-7. `pixel_weights`: the weights of the pixels in the photometric loss, which follows,
-8. `modify_loss`: further terms and factors of the loss,
-9. `needs_backward`: is the loss worth a backward pass? It follows.
-10. `after_backward`: the gradients of the parameters, before the optimizer's step, which follows,
-11. `densification_grad2d`: the image-plane gradient that densification reads,
+1. `allows_view`: whether the sampler may choose this view,
+2. `training_views`: changes cameras and photographs for this step,
+3. `render_camera`: changes the camera of the render,
+4. `before_render`: changes the Gaussians for this render; then the render,
+5. `to_photograph`: resizes the render to the photograph's size,
+6. `match_colors`: changes the colours of the render,
+7. `pixel_weights`: weights of the pixels in the photometric loss; then the loss,
+8. `modify_loss`: adds terms to the loss or scales it,
+9. `needs_backward`: whether to run the backward pass; then the backward pass,
+10. `after_backward`: changes the gradients of the parameters; then the optimizer's step,
+11. `densification_grad2d`: changes the image-plane gradient for densification,
 12. `may_grow`: at a refinement, which Gaussians may grow,
 13. `growth_scores`: at a refinement with a budget, which Gaussians grow first,
 14. `opacity_attenuation`: at a reset of the opacities,
-15. `on_gaussians_changed`: after a refinement or a reset that changed anything,
+15. `on_gaussians_changed`: after a refinement or a reset with any change,
 16. `to_prune`: further Gaussians to remove,
-17. `on_gaussians_changed`: after that has removed any,
-18. `after_step`: the Gaussians as the next step gets them.
+17. `on_gaussians_changed`: if any were removed,
+18. `after_step`: changes the Gaussians at the end of the step.
 
-A step without a backward pass leaves out 10 and 11. After the last step training calls `bake` and
-`after_training`; `bake` also runs on a copy of the Gaussians wherever they are evaluated. Then the
-cell asks for `findings`.
+A step without a backward pass skips 10 and 11. After the last step training calls `bake` and
+`after_training`; `bake` also runs on a copy of the Gaussians at each evaluation during training.
+Then the cell calls `findings`.
 """
 
 from __future__ import annotations
@@ -55,19 +55,19 @@ class TrainingView(Protocol):
 
     @property
     def name(self) -> str:
-        """The name of the view's photograph, unique among the views."""
+        """Name of the view's photograph, unique among the views."""
 
     @property
     def tag(self) -> str:
-        """The resolution class of the view, `HR` or `LR`."""
+        """Resolution class of the view, `HR` or `LR`."""
 
     @property
     def sampling_rate(self) -> float:
-        """The sampling rate of the view over the highest rate of all views, in (0, 1]."""
+        """Sampling rate of the view, relative to the highest rate of all views, in (0, 1]."""
 
     @property
     def supersampling(self) -> float:
-        """How many times as many px a side the view needs to be as fine as the finest views."""
+        """Factor of width and height at which the view would be as fine as the finest views."""
 
     @property
     def camera(self) -> Camera:
@@ -75,96 +75,98 @@ class TrainingView(Protocol):
 
     @property
     def image(self) -> Tensor:
-        """The photograph [H, W, 3] in 0..1. It may be a new tensor at each access.
+        """The photograph [H, W, 3] in 0..1. Each access may return a new tensor.
 
-        Outside the mask it has colours of the inside, never what the mask hides.
+        Outside the mask it is filled with colours from the inside: the hidden pixels are not
+        loaded.
         """
 
     @property
     def mask(self) -> Tensor | None:
-        """The pixels that are used [H, W] bool, at least one; None where all are."""
+        """[H, W] bool, True for a used pixel, at least one; None if all are used."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """One step of training: its position in the run, and the view that it renders."""
+    """One step of training: its position in the run, and its view."""
 
     number: int
-    """The number of the step, from 0."""
+    """Number of the step, from 0."""
     total: int
-    """The number of steps of the whole run."""
+    """Number of steps of the whole run."""
     view: TrainingView
-    """The view that the step renders, as `training_views` returned it."""
+    """The view that the step renders, from `training_views`."""
     log: dict[str, float] = field(default_factory=dict, compare=False)
-    """Values that components record, by column names `<component>.<quantity>`. A row of history.csv
-    has the mean of each column over the steps since the row before that recorded it."""
+    """`<component>.<quantity>` -> value of this step, a column of history.csv. A row there has the
+    mean over the steps since the previous row in which a component recorded the quantity."""
 
     @property
     def nominal(self) -> float:
-        """The position of the step in a run of 30,000 steps, in which schedules are written."""
+        """The step's position in a run of 30,000 steps, the unit of all schedules."""
         return self.number * NOMINAL_STEPS / self.total
 
 
 class ViewRenderer(Protocol):
     """Renders training views for components (`xrgs.training.rendering.StepRenderer`).
 
-    Its work and its time count as the run's.
+    Its work and time are added to those of the run.
     """
 
     def photograph(self, gaussians: Gaussians, step: Step) -> Tensor:
-        """Render the step's view as it is compared with its photograph: [H, W, 3], no graph."""
+        """Render the step's view as for the loss: [H, W, 3], detached from autograd."""
 
     def attribute(self, pixels: Tensor, gaussians: Gaussians, step: Step) -> Tensor:
-        """Sum a map [H, W] of the step's view over the weights of each Gaussian in it: [N]."""
+        """Sum a map [H, W] over the step's view, by the blending weights of each Gaussian: [N]."""
 
 
 @dataclass(frozen=True)
 class TrainingSetup:
-    """Everything that a component may read when it is built."""
+    """The inputs for building a component."""
 
     components: ComponentsConf
-    """The settings of all components, `components` of the config."""
+    """Settings of all components, `components` of the config."""
     data: Dataset
     """The training views, the SfM points, the scene scale and the downsampling factor."""
     splat: SplatConf
-    """The settings of the model, its optimizer and its densification, `splat` of the config."""
+    """Settings of the model, its optimizer and its densification, `splat` of the config."""
     backend: str
-    """`torch` or `native`: the implementation that renders and computes losses."""
+    """`torch` or `native`: the implementation of rendering and losses."""
     seed: int = 0
-    """The seed of the run (`xrgs.training.seeding.seeded_generator`)."""
+    """Seed of the run (`xrgs.training.seeding.seeded_generator`)."""
 
 
 class Component:
-    """One change to training. Every hook is the identity until a subclass overrides it.
+    """One change to training. Every hook changes nothing unless a subclass overrides it.
 
     Attributes:
         settings_type: For components of other packages: the dataclass of their settings. xrgs
-            builds it from `components.plugins.<name>` of the config, checking names and types.
+            builds it from `components.plugins.<name>` of the config, and checks names and types.
     """
 
     settings_type: ClassVar[type[Any] | None] = None
 
     @classmethod
     def from_settings(cls, settings: Any, setup: TrainingSetup) -> Self | None:
-        """Build the component that the settings describe.
+        """Build the component from its settings.
 
         Args:
-            settings: The component's own settings: a dataclass of `xrgs.config`, or a
-                `settings_type` for components of other packages.
+            settings: The component's settings: a dataclass of `xrgs.config`, or a `settings_type`
+                for components of other packages.
             setup: The data, the model's settings and the other components' settings.
 
         Returns:
-            The component, or None where the settings leave it off, which must change nothing.
+            The component, or None if the settings mean "off"; an "off" component must change
+            nothing.
 
         Raises:
-            XrgsError: A setting is out of its range; the message names its key.
+            XrgsError: A setting is out of range; the message names its key.
         """
         raise NotImplementedError(f"{cls.__name__} does not define from_settings")
 
     def before_training(self, renderer: ViewRenderer) -> None:
-        """Take the renderer, for a component that renders other views than the step's own.
+        """Get a renderer, for a component that renders views other than the step's.
 
-        Training calls it once, before the first step or the first step after a checkpoint.
+        Training calls this once, before the first step or the first step after a checkpoint.
 
         Args:
             renderer: Renders any training view with all components of the run.
@@ -174,8 +176,8 @@ class Component:
         """Decide whether training may sample the step's view at that step.
 
         Returns:
-            False excludes the view. The sampler skips it, and leaves it out of epochs that begin
-            while it is excluded.
+            False if the view is excluded. The sampler skips it, and epochs that begin while it is
+            excluded do not contain it.
         """
         del step
         return True
@@ -183,25 +185,25 @@ class Component:
     def training_views(
         self, views: Mapping[str, TrainingView], step: Step
     ) -> Mapping[str, TrainingView]:
-        """Choose the cameras and the photographs that training uses at this step.
+        """Choose the cameras and photographs for this step.
 
-        All later hooks see a view of the result as the step's view. The result must depend on the
-        number of the step alone, so that a continued run has the same views.
+        Later hooks get the step's view from the result. The result must depend only on the number
+        of the step, so that a continued run has the same views.
 
         Args:
-            views: All training views by name, as the components before this one changed them.
+            views: Name -> training view, of all views, as the previous components changed them.
             step: The step with the sampled view.
 
         Returns:
-            Views of the same names and tags, each with a photograph of its camera's size. They are
-            `views` itself if nothing is changed, and the same object as at the step before if
-            nothing has changed since. The loss prepares the photographs anew for another object.
+            Views of the same names and tags, each with a photograph of its camera's size. Return
+            `views` itself for no change, and the same object as in the last step if nothing has
+            changed since: for a new object, training prepares all photographs again.
         """
         del step
         return views
 
     def before_render(self, activated: ActivatedGaussians, step: Step) -> ActivatedGaussians:
-        """Change the Gaussians for this step's render alone.
+        """Change the Gaussians for this step's render only.
 
         Args:
             activated: N Gaussians with scales in world units and opacities in 0..1.
@@ -214,10 +216,10 @@ class Component:
         return activated
 
     def render_camera(self, camera: Camera, step: Step) -> Camera:
-        """Choose the camera that the step's view is rendered with.
+        """Choose the camera for rendering the step's view.
 
         Args:
-            camera: The camera of the view, as the components before this one changed it.
+            camera: The camera of the view, as the previous components changed it.
             step: The step with its view.
 
         Returns:
@@ -227,13 +229,13 @@ class Component:
         return camera
 
     def to_photograph(self, image: Tensor, step: Step) -> Tensor:
-        """Bring a render to the size of the photograph, as the photograph was formed.
+        """Resize a render to the photograph's size, in the way the photograph was formed.
 
-        A component that changes the size in `render_camera` restores it here. Components are called
-        in reverse order.
+        A component that changes the size in `render_camera` restores it here. This hook runs in
+        reverse order of the components.
 
         Args:
-            image: The render [h, w, 3], as the components after this one changed it.
+            image: The render [h, w, 3], as the components later in the order changed it.
             step: The step with its view.
 
         Returns:
@@ -243,17 +245,18 @@ class Component:
         return image
 
     def match_colors(self, image: Tensor, step: Step) -> Tensor:
-        """Bring the colours of a render to those that its photograph has been taken with.
+        """Map the colours of a render to those of its photograph, by exposure for example.
 
-        Training calls it for the render of the step with gradients enabled, and for renders of
-        other views that components ask for without.
+        Training calls this with gradients enabled for the render of the step, and with gradients
+        disabled for renders of other views that components ask for.
 
         Args:
             image: [H, W, 3] after `to_photograph`.
             step: The step with its view.
 
         Returns:
-            The image [H, W, 3] that is compared with the photograph, made pixel by pixel.
+            The image [H, W, 3] for the loss. Each pixel must depend only on the same pixel of
+            `image`.
         """
         del step
         return image
@@ -267,9 +270,9 @@ class Component:
         """Change the loss before backward, by a further term or a factor.
 
         Args:
-            loss: Scalar; the photometric loss, as the components before this one changed it.
-            image: [H, W, 3] render of the view as it is compared with the photograph, not clamped
-                to 0..1. Outside the view's mask it is the photograph.
+            loss: Scalar; the photometric loss, as the previous components changed it.
+            image: [H, W, 3] render of the view after `match_colors`, not clamped to 0..1. Outside
+                the view's mask it has the pixels of the photograph.
             gaussians: The N trained Gaussians; a term may depend on their parameters.
             step: The step with its view.
 
@@ -280,23 +283,23 @@ class Component:
         return loss
 
     def needs_backward(self, loss: Tensor, step: Step) -> bool:
-        """Decide whether the step's loss is worth a backward pass.
+        """Decide whether the step runs a backward pass.
 
-        Training calls it once in every step, whatever the other components answer.
+        Training calls this in every step, also if another component has returned False.
 
         Args:
             loss: Scalar; the loss of the step, with all terms and weights.
             step: The step with its view.
 
         Returns:
-            False leaves out the backward pass, the optimizer's step and the step's part in the
-            statistics of densification. Schedules go on, the decay of the learning rate too.
+            False to skip the backward pass, the optimizer's step and the step's contribution to
+            the densification statistics. Schedules, as the learning rate's, go on.
         """
         del loss, step
         return True
 
     def after_backward(self, gaussians: Gaussians, step: Step) -> None:
-        """Change the gradients of the parameters in place, before the optimizer reads them.
+        """Change the gradients of the parameters in place, before the optimizer's step.
 
         Args:
             gaussians: N Gaussians with their gradients. A change of the gradient of `shN` has no
@@ -305,10 +308,10 @@ class Component:
         """
 
     def densification_grad2d(self, grad2d: Tensor, step: Step) -> Tensor:
-        """Change the image-plane gradient that densification averages, and nothing else.
+        """Change the image-plane gradient for the statistics of densification.
 
         Args:
-            grad2d: [N, 2] gradient of the loss with respect to the projected means, per pixel.
+            grad2d: [N, 2] gradient of the loss with respect to the projected means, per px.
             step: The step with its view.
 
         Returns:
@@ -318,9 +321,9 @@ class Component:
         return grad2d
 
     def densification_groups(self, settings: DensifySettings) -> Groups | None:
-        """Return thresholds of densification and pruning by the views' tags, or None.
+        """Return thresholds of growth and pruning for each tag of views; None for common ones.
 
-        Training calls it once, before the first step. At most one component may return groups.
+        Training calls this once, before the first step. Only one component may return groups.
 
         Args:
             settings: The settings of densification.
@@ -331,7 +334,7 @@ class Component:
     def may_grow(self, gaussians: Gaussians, step: Step) -> Tensor | None:
         """Choose which of the Gaussians above the growth threshold may grow.
 
-        Training calls it at refinements, before anything grows.
+        Training calls this at refinements, before any Gaussian grows.
 
         Returns:
             [N] bool, or None if all Gaussians may grow.
@@ -340,13 +343,13 @@ class Component:
         return None
 
     def growth_scores(self, gaussians: Gaussians, step: Step) -> Tensor | None:
-        """Rank the Gaussians that would grow where a budget leaves room for some of them.
+        """Rank the growing Gaussians if a budget has room for only some of them.
 
-        Training calls it at such refinements alone, before anything grows. The Gaussians with the
-        highest scores grow.
+        Training calls this only at such refinements, before any Gaussian grows. The Gaussians with
+        the highest scores grow.
 
         Returns:
-            Scores [N] of at least 0; None ranks by the mean image-plane gradient.
+            Scores [N], at least 0; None to rank by the mean image-plane gradient.
         """
         del gaussians, step
         return None
@@ -354,68 +357,68 @@ class Component:
     def to_prune(self, gaussians: Gaussians, step: Step) -> Tensor | None:
         """Choose further Gaussians to remove.
 
-        Training calls it in every step, also after densification has stopped. If densification
+        Training calls this in every step, also after densification has stopped. If densification
         changed the Gaussians in this step, `on_gaussians_changed` was called before.
 
         Returns:
-            [N] bool, or None if all Gaussians stay.
+            [N] bool, True for a Gaussian to remove; None to keep all.
         """
         del gaussians, step
         return None
 
     def after_step(self, gaussians: Gaussians, step: Step) -> None:
-        """Change the values of the Gaussians in place, when all else of the step is done.
+        """Change the values of the Gaussians in place, at the end of the step.
 
         The optimizer's moments stay as they are.
         """
 
     def opacity_attenuation(self, gaussians: Gaussians) -> Tensor | None:
-        """Tell by which factors `before_render` lowers opacities in every view.
+        """Return the factors of the opacities in `before_render`, which are the same for all views.
 
-        Training calls it when it resets opacities. If the step was a refinement too,
-        `on_gaussians_changed` has not been called yet.
+        Training calls this at opacity resets. If the step was a refinement too,
+        `on_gaussians_changed` has not been called for it yet.
 
         Returns:
-            Factors [N] above 0 and at most 1, or None if opacities are not lowered.
+            Factors [N] above 0 and at most 1; None if `before_render` does not change opacities.
         """
         del gaussians
         return None
 
     def on_gaussians_changed(self, gaussians: Gaussians) -> None:
-        """Update what depends on the number and the order of the Gaussians.
+        """Update state that depends on the number and order of the Gaussians.
 
-        Training calls it before the first step, and whenever densification or `to_prune` has
-        added, removed or reset Gaussians.
+        Training calls this before the first step, and whenever Gaussians were added, removed or
+        reset.
         """
 
     def bake(self, gaussians: Gaussians) -> None:
-        """Apply to the Gaussians, in place, what `before_render` does in every view.
+        """Apply the change of `before_render` to the Gaussians themselves, in place.
 
-        Training calls it on the trained Gaussians before they are saved, and on a copy of the
-        Gaussians whenever they are evaluated during training.
+        Only for changes that are the same in all views. Training calls this on the trained
+        Gaussians before they are saved, and on a copy at each evaluation during training.
         """
 
     def after_training(self, gaussians: Gaussians) -> None:
-        """Look at the trained Gaussians before they are saved."""
+        """Read the trained Gaussians before they are saved, for `findings` for example."""
 
     def findings(self) -> list[str]:
-        """Return what training has found out about the photographs, for the cell's summary.
+        """Return lines about the training or the photographs, for the cell's summary.
 
         Returns:
-            Lines for people; each begins with the component's name, as in `floaters: ...`.
+            Lines to be printed; each begins with the component's name, as in `floaters: ...`.
         """
         return []
 
     def state_dict(self) -> dict[str, Any]:
-        """Return what the steps so far have changed in the component, for a checkpoint.
+        """Return the component's state for a checkpoint.
 
         Returns:
-            Tensors and JSON values by name; empty if there is no state.
+            Name -> tensor or JSON value; empty if there is no state.
         """
         return {}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore what `state_dict` returned.
+        """Restore a state of `state_dict`.
 
         Args:
             state: The state of a component that was built from the same settings; never empty.
@@ -427,6 +430,6 @@ class Component:
 
 
 def check_not_negative(key: str, value: float) -> None:
-    """Raise XrgsError, naming the key of the config, unless a value is finite and at least 0."""
+    """Raise XrgsError, naming the config's key, unless the value is finite and at least 0."""
     if not (math.isfinite(value) and value >= 0):
         raise XrgsError(f"{key}={value}: must be a finite number, 0 or more")

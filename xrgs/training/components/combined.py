@@ -1,4 +1,4 @@
-"""All components of a run as one: each hook combines the answers of the components."""
+"""Combines the components of a run into one: each hook calls that of all components."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ if TYPE_CHECKING:
     from xrgs.training.components.base import Step
 
 
-#: The hooks by which components decide what densification grows.
+#: The hooks that influence which Gaussians grow.
 _GROWTH = ("densification_groups", "may_grow", "growth_scores")
 
 
 class Components(tuple[Component, ...], Component):
-    """The components that are on, in the order in which their hooks run; empty is the baseline.
+    """The components that are on, in the order of their hooks; empty is the baseline.
 
-    They are one component themselves: `_FOLDS` says how each hook combines their answers.
+    The tuple is a component itself: `_FOLDS` has the function that combines each hook's results.
     """
 
     __slots__ = ()
 
     def override(self, hook: str) -> bool:
-        """Whether any component has a hook of its own; without one, the hook is the identity."""
+        """Whether any component overrides a hook; otherwise the hook changes nothing."""
         return any(_overrides(type(component), hook) for component in self)
 
     def densification_groups(self, settings: DensifySettings) -> Groups | None:
-        """The groups of the one component that has any.
+        """Return the groups of the one component that has any.
 
         Raises:
             XrgsError: Two components have groups.
@@ -56,11 +56,11 @@ class Components(tuple[Component, ...], Component):
         return next(iter(groups.values()), None)
 
     def check_strategy(self, name: str, strategy: type[Strategy]) -> None:
-        """Refuse components that decide what grows, for a strategy that does not ask them.
+        """Refuse components with growth hooks for a strategy that does not call these hooks.
 
         Args:
             name: The strategy's name, `splat.strategy` of the config.
-            strategy: Its class.
+            strategy: The class of the strategy.
 
         Raises:
             XrgsError: The message names the components.
@@ -77,7 +77,7 @@ class Components(tuple[Component, ...], Component):
             )
 
     def strategy_hooks(self, step: Step) -> StrategyHooks:
-        """What the components decide about densification at a step."""
+        """Return the components' hooks for the strategy at a step."""
         return StrategyHooks(
             may_grow=lambda gaussians: self.may_grow(gaussians, step),
             growth_scores=lambda gaussians: self.growth_scores(gaussians, step),
@@ -85,7 +85,7 @@ class Components(tuple[Component, ...], Component):
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """The states of the components that have one, by position and class name."""
+        """Return `<position>.<class name>` -> state, of the components that have a state."""
         states = {name: component.state_dict() for name, component in self._named()}
         return {name: state for name, state in states.items() if state}
 
@@ -96,7 +96,7 @@ class Components(tuple[Component, ...], Component):
                 component.load_state_dict(state[name])
 
     def _named(self) -> list[tuple[str, Component]]:
-        """Each component with a name that is unique even where class names are not."""
+        """Return each component with a unique name, even if class names repeat."""
         return [(f"{i}.{type(component).__name__}", component) for i, component in enumerate(self)]
 
 
@@ -111,19 +111,19 @@ def _call(hooks: list[Callable[..., None]], *arguments: Any) -> None:
 
 
 def _apply(hooks: list[Callable[..., Any]], value: Any, *arguments: Any) -> Any:
-    """Change a value by each hook in turn."""
+    """Pass a value through each hook in turn."""
     for hook in hooks:
         value = hook(value, *arguments)
     return value
 
 
 def _apply_reversed(hooks: list[Callable[..., Any]], value: Any, *arguments: Any) -> Any:
-    """Change a value by each hook, the last one first."""
+    """Pass a value through each hook, the last hook first."""
     return _apply(hooks[::-1], value, *arguments)
 
 
 def _all(hooks: list[Callable[..., bool]], *arguments: Any) -> bool:
-    """Whether all hooks say yes. Every one is asked: some count their calls."""
+    """Return whether all hooks return True. Every hook is called, since some count their calls."""
     answers = [hook(*arguments) for hook in hooks]
     return all(answers)
 
@@ -133,7 +133,7 @@ def _reduce(
     hooks: list[Callable[..., Tensor | None]],
     *arguments: Any,
 ) -> Tensor | None:
-    """Combine the answers that are not None; None where there is none."""
+    """Combine the results that are not None; return None if there are none."""
     answers = [answer for hook in hooks if (answer := hook(*arguments)) is not None]
     return functools.reduce(combine, answers) if answers else None
 
@@ -143,7 +143,7 @@ def _joined(hooks: list[Callable[..., list[str]]]) -> list[str]:
     return [line for hook in hooks for line in hook()]
 
 
-#: How the components' answers become one, by the hook.
+#: Hook -> function that combines the components' results.
 _FOLDS: dict[str, Callable[..., Any]] = {
     "before_training": _call,
     "allows_view": _all,

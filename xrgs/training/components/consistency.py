@@ -29,7 +29,7 @@ _LR_MODES = ("exact", "fold", "off")
 
 
 class Consistency(Component):
-    """Compares the render with the photograph at the opposite resolution too.
+    """Compares render and photograph also at the opposite resolution, LR for HR and vice versa.
 
     Section 5.6 of the paper adds to the loss of every view
 
@@ -44,26 +44,25 @@ class Consistency(Component):
 
     - w is 0.1 in `conf/ablation/consistency.yaml`, lambda_1 0.8 and lambda_2 0.2, as in the
       photometric loss.
-    - phi is antialiased, resamples to an exact size in pixels, and its result is not clamped. It
-      makes an HR view `factor` times smaller and an LR view `factor` times larger.
-    - The view's weight multiplies L_cons as well (`xrgs.training.components.weighting`). Otherwise
-      this term would give back to LR views the influence that loss weighting takes from them.
-    - An LR view is downsampled like an HR view if its longer side is nearer to the HR views' than
-      to 1 / `factor` of it. Such views are not small: they are zoomed digitally, compressed, or
-      tagged by distance.
+    - phi is antialiased and not clamped, and resamples to an exact size in pixels: `factor` times
+      smaller for an HR view, `factor` times larger for an LR view.
+    - The view's weight multiplies L_cons too (`xrgs.training.components.weighting`). Otherwise this
+      term would undo the weighting of LR views.
+    - An LR view is downsampled like an HR view if its longer side is closer to that of the HR views
+      than to 1 / `factor` of it: such LR views are zoomed digitally, compressed, or tagged by
+      distance.
 
-    phi is linear, so that phi(I_rend) - phi(I) = phi(I_rend - I): for an LR view the term contains
-    no information that the photometric loss lacks, and costs factor^2 times as many pixels.
-    `lr_mode` chooses what happens in LR views:
+    phi is linear: phi(I_rend) - phi(I) = phi(I_rend - I). So for an LR view the term adds no
+    information to the photometric loss, and costs factor^2 times as many pixels. `lr_mode` chooses
+    the term of LR views:
 
-    - `exact` is the paper's term.
-    - `off` leaves LR views out.
-    - `fold` adds `weight * l1 * mean |I_rend - I|` at the view's own size, the L1 term if phi kept
-      L1 norms, and leaves out the SSIM term. The rows of phi sum to 1 and its columns to factor^2
-      (to 3% at a corner), so that `fold` equals the exact L1 term where the error keeps its sign.
-      It is larger where signs alternate from pixel to pixel and phi averages them out (1.23 times
-      for white noise at factor 5). It is never less than 0.7 times the exact term, since the
-      absolute columns sum to at most 1.19 factor along an axis.
+    - `exact`: the paper's term.
+    - `off`: no term.
+    - `fold`: `weight * l1 * mean |I_rend - I|` at the view's size, without SSIM. It equals the
+      exact L1 term where the error has a constant sign, since the rows of phi sum to 1 and its
+      columns to factor^2 (to 3% at a corner). It is larger where signs alternate from pixel to
+      pixel and phi averages them out (1.23 times for white noise at factor 5). It is at least 0.7
+      times the exact term, since the absolute columns sum to at most 1.19 factor along an axis.
     """
 
     def __init__(
@@ -73,7 +72,7 @@ class Consistency(Component):
         factor: int,
         backend: str = "torch",
     ) -> None:
-        """Compute the sizes of the paired images, and those images that are kept.
+        """Compute the sizes of the paired images, and the paired images that are cached.
 
         Args:
             settings: `components.consistency` of the config.
@@ -118,28 +117,28 @@ class Consistency(Component):
         return loss + consistency
 
     def _consistency_loss(self, image: Tensor, view: TrainingView) -> Tensor | None:
-        """L_cons of a render [H, W, 3], a scalar; None where the view has no such term."""
+        """Return L_cons of a render [H, W, 3], a scalar; None if the view has no such term."""
         if view.tag == "HR" or self.lr_mode == "exact":
             target = self.paired_targets[view.name]
             height, width = target.image.shape[:2]
             projected = resize(image, height, width, backend=self.backend)
-            # The weight is part of both factors: outside, it is one more pass over the image.
+            # Multiplying the result by the weight would be one more pass over the image.
             l1, ssim = self.weight * self.l1, self.weight * self.ssim
             return photometric_loss(projected, target, l1=l1, ssim=ssim, backend=self.backend)
         if self.lr_mode == "fold":
-            # Summed in double, whose last digits alone depend on the number of threads.
+            # In double, where only digits below float32's precision depend on the thread count.
             difference = (image - view.image).abs().mean(dtype=torch.float64)
             return self.weight * self.l1 * difference.to(image)
         return None
 
     def _paired_target(self, view: TrainingView) -> Target:
-        """The photograph of a view at the opposite resolution."""
+        """Resample the photograph of a view to the opposite resolution."""
         image = resize(view.image, *self.sizes[view.name], backend=self.backend)
         return prepare_target(image, backend=self.backend)
 
 
 def _opposite_size(view: TrainingView, factor: int, hr_long_side: float) -> tuple[int, int]:
-    """The height and width of a paired image; `hr_long_side` is of the largest HR view, px."""
+    """Return height and width of the paired image; `hr_long_side` is the largest HR view's, px."""
     height, width = view.camera.height, view.camera.width
     if view.tag == "HR" or max(height, width) > hr_long_side / math.sqrt(factor):
         height, width = round(height / factor), round(width / factor)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class Curriculum(Component):
-    """Trains on LR views alone before step `lr_only`: the LR-only warm-up.
+    """Trains only on LR views before step `lr_only`: the LR-only warm-up.
 
     Section 5.5 of the paper, with N typically 5000:
 
@@ -27,9 +27,9 @@ class Curriculum(Component):
 
     N is `lr_only`, in steps of a 30,000-step run.
 
-    Our choice where the paper is silent: densification, pruning and opacity resets go on during the
-    warm-up, on the statistics of LR views. An epoch through the LR views that is under way when the
-    warm-up ends is completed first.
+    Our choice where the paper is silent: densification, pruning and opacity resets run during the
+    warm-up, on the statistics of LR views. The epoch of LR views in progress at the end of the
+    warm-up is completed first.
     """
 
     def __init__(self, settings: CurriculumConf, views: Sequence[TrainingView]) -> None:

@@ -14,38 +14,38 @@ if TYPE_CHECKING:
 
 
 class Densify(Component):
-    """Gives LR views their own thresholds of densification and pruning.
+    """Gives LR views their own thresholds of growth and pruning.
 
-    Section 5.4 of the paper maintains two sets of thresholds for the adaptive density control of
-    3D Gaussian Splatting [kerbl2023, section 5.2], as gsplat's `DefaultStrategy` [ye2025] has it:
+    Section 5.4 of the paper has two sets of thresholds for the adaptive density control of 3D
+    Gaussian Splatting [kerbl2023, section 5.2], as in gsplat's `DefaultStrategy` [ye2025]:
 
         threshold_HR < threshold_LR
 
-    HR views have the thresholds of `splat.densify`: `grow_grad2d` 2e-4 in normalised device units,
-    `prune_opacity` 0.005. LR views have `lr_grow` and `lr_prune` times those.
+    The thresholds of HR views are those of `splat.densify`: `grow_grad2d` 2e-4 in normalised device
+    units, `prune_opacity` 0.005. Those of LR views are `lr_grow` and `lr_prune` times as high.
 
-    Our choice where the paper is silent: it gives no values; both factors are 2 in
-    `conf/ablation/densify.yaml`. Nor does it say which thresholds apply at a refinement, where the
-    statistics are averages over 100 steps on views of both kinds. `decide` chooses:
+    Our choice where the paper is silent: the paper gives no values; both factors are 2 in
+    `conf/ablation/densify.yaml`. It does not say which thresholds apply at a refinement, whose
+    statistics are averages over 100 steps on HR and LR views. `decide` chooses:
 
-    - `current_view`, in the ablations `densify` and `xrgs`: all views share one statistic, and the
-      view of the step at which Gaussians are refined sets both thresholds, for all Gaussians. This
+    - `current_view`, in the ablations `densify` and `xrgs`: all views share one statistic. The view
+      trained at the step of the refinement decides which thresholds apply to all Gaussians. This
       is the literal reading of sections 5.1 and 5.4.
     - `per_class`: HR and LR views have separate statistics, and a Gaussian grows if either is above
-      its own threshold. With equal thresholds this is not the identity: one of two means over fewer
-      views is above a threshold more often than the mean over all views. The LR prune threshold
-      applies to Gaussians to which no HR view has contributed an image-plane gradient since the
-      last refinement.
-    - `own_threshold`: each view's gradient is divided by the view's own threshold, and a Gaussian
-      grows if the mean over all views is above 1. Nothing depends on the view of the refinement.
-      Pruning is as with `per_class`.
+      its threshold. Even equal thresholds change the result: the larger of two means over fewer
+      views exceeds a threshold more often than the mean over all views. The LR prune threshold
+      applies to Gaussians without an image-plane gradient from an HR view since the last
+      refinement.
+    - `own_threshold`: the gradients of each view are divided by the view's threshold, and a
+      Gaussian grows if their mean over all views is above 1. The view at the refinement does not
+      matter. Pruning is as with `per_class`.
 
-    The opacity reset follows the larger prune threshold. Otherwise the refinement after a reset
-    would prune every Gaussian to which the larger threshold applies.
+    The cap of the opacity reset is computed from the larger prune threshold. Otherwise the next
+    refinement would prune every Gaussian to which the larger threshold applies.
     """
 
     def __init__(self, settings: DensifyConf) -> None:
-        """Take the factors and the rule from the settings; XrgsError if `decide` is unknown."""
+        """Read the factors and `decide` from the settings; XrgsError if `decide` is unknown."""
         if settings.decide not in DECIDE:
             raise XrgsError(
                 f"components.densify.decide={settings.decide}: must be one of shared,"
@@ -64,7 +64,7 @@ class Densify(Component):
         return None if settings.decide == "shared" else cls(settings)
 
     def densification_groups(self, settings: DensifySettings) -> Groups:
-        """Return the thresholds of HR and LR views; HR comes first, and so takes precedence."""
+        """Return the thresholds of HR and LR views; HR is first and has precedence (`Groups`)."""
         hr = Thresholds(settings.grow_grad2d, settings.prune_opacity)
         lr = Thresholds(
             hr.grow_grad2d * self.settings.lr_grow, hr.prune_opacity * self.settings.lr_prune

@@ -1,4 +1,4 @@
-"""A colour map of each photograph, learned with the splats: exposure and white balance."""
+"""An affine colour map for each photograph, trained with the Gaussians: exposure, white balance."""
 
 from __future__ import annotations
 
@@ -25,36 +25,36 @@ if TYPE_CHECKING:
 
 
 class Exposure(Component):
-    """Gives each training photograph a colour map of its own, which splats need not explain then.
+    """Trains an affine colour map for each training photograph, besides the Gaussians.
 
-    Cameras choose exposure and white balance for each photograph. With c the colour of a pixel of
-    the render, the loss of photograph i compares the photograph with
+    Cameras choose exposure and white balance for each photograph. For a pixel of the render with
+    colour c, the loss compares photograph i with
 
         M_i c + b_i,
 
-    where M_i is a 3 x 3 matrix and b_i an offset, both in sRGB values of range 1, as photographs
-    are. The map [M_i | b_i] begins as the identity and is learned by Adam [kingma2015] with a rate
-    of its own, which falls exponentially from `lr` to `lr_final` times it. `mode` chooses what is
-    learned: `affine` all twelve numbers, `gain` the diagonal of M_i alone.
+    where M_i is a 3 x 3 matrix and b_i an offset, both for sRGB values in 0..1. The map
+    [M_i | b_i] starts as the identity and is trained by Adam [kingma2015]; the rate falls
+    exponentially from `lr` to `lr * lr_final`. `mode` chooses the trained numbers: `affine` all
+    twelve, `gain` only the diagonal of M_i.
 
     The authors' code of 3D Gaussian Splatting [kerbl2023] has such a 3 x 4 map for each photograph,
-    with rates from 0.01 to 0.001, and the identity at its start is all that holds it. Urban
-    Radiance Fields [rematas2022] have a 3 x 3 matrix. Ours:
+    with rates from 0.01 to 0.001; it starts as the identity without any further constraint. Urban
+    Radiance Fields [rematas2022] have a 3 x 3 matrix. Our additions:
 
-    - The mean map of the HR training photographs is the identity: after every step its deviation is
-      subtracted from all maps. Otherwise splats and maps could drift together, and test views,
-      which have no map, would be of other colours than the photographs on the average. Without HR
-      views the mean is over all training views.
-    - `prior` times the squared distance of a map to the identity, the sum over its numbers, is
+    - The mean map of the HR training photographs is the identity: after every step the deviation of
+      the mean is subtracted from all maps. Otherwise Gaussians and maps could drift together, and
+      test views, which have no map, would have a colour cast. Without HR views the mean is over all
+      training views.
+    - `prior` times the squared distance of a map from the identity, summed over its numbers, is
       added to the loss.
-    - A map moves at steps on its own photograph alone.
+    - A map is updated only at steps on its photograph.
 
-    The map comes after all that forms the photograph in `to_photograph`. It applies to what the
-    consistency loss compares too: the map of a pixel and the resampling of pixels commute. No map
-    is applied at evaluation; `psnr_fitted` tells the score after the best map for each test view.
+    The map is applied after `to_photograph`, and also before the consistency loss: a map of each
+    pixel and resampling commute. No map is applied at evaluation; `psnr_fitted` is the score after
+    the best map for each test view.
 
-    `exposure.gain` records the gain of the step's map: the mean of the sums of M_i's rows, by which
-    it multiplies the brightness of grey.
+    `exposure.gain` records the gain of the step's map, its factor for the brightness of grey: the
+    mean of the row sums of M_i.
     """
 
     def __init__(self, settings: ExposureConf, views: Sequence[TrainingView]) -> None:
@@ -68,20 +68,20 @@ class Exposure(Component):
         self.names = [view.name for view in views]
         of_hr = [at for at, view in enumerate(views) if view.tag == "HR"]
         self.reference = of_hr or list(range(len(views)))
-        """The views over which the mean map is the identity."""
+        """Indices of the views whose mean map is the identity."""
         self.learned = torch.ones(3, 4) if settings.mode == "affine" else torch.eye(3, 4)
-        """1 for a number that is learned, 0 for another [3, 4]."""
+        """[3, 4] 1 for a trained number of the map, 0 for a fixed one."""
         self.deviations = RowAdam(torch.zeros(len(views), 3, 4))
-        """Map less identity."""
+        """Map minus identity, for each view [views, 3, 4]."""
         self.drawn: Tensor | None = None
-        """The map of the step's view [3, 4], which gets the gradient."""
+        """Map of the step's view [3, 4], on which the gradient accumulates."""
 
     @classmethod
     def from_settings(cls, settings: ExposureConf, setup: TrainingSetup) -> Self | None:
         """Build the component; the mode `none` leaves it off.
 
         Raises:
-            XrgsError: The mode is unknown, or a number is out of its range.
+            XrgsError: The mode is unknown, or a setting is out of range.
         """
         key = "components.exposure"
         if settings.mode not in ("none", "affine", "gain"):
@@ -102,13 +102,13 @@ class Exposure(Component):
     def match_colors(self, image: Tensor, step: Step) -> Tensor:
         """Return the render [H, W, 3] in the colours of its photograph."""
         colors = self.map_of(step.view.name).to(image)
-        if torch.is_grad_enabled():  # other renders are looked at, and teach nothing
+        if torch.is_grad_enabled():  # not for other components' renders
             self.drawn = colors.requires_grad_()
             step.log["exposure.gain"] = _gain(colors)
         return apply_map(image, colors)
 
     def after_backward(self, gaussians: Gaussians, step: Step) -> None:
-        """Move the map of the step's photograph, and bring the mean map to the identity."""
+        """Update the map of the step's photograph, and reset the mean map to the identity."""
         del gaussians
         if self.drawn is None or self.drawn.grad is None:
             return
@@ -117,12 +117,12 @@ class Exposure(Component):
         gradient = self.drawn.grad.to(maps) + 2 * settings.prior * maps[at]
         rate = settings.lr * settings.lr_final ** (step.number / step.total)
         self.deviations.update(at, gradient * self.learned, rate)
-        # Written out: the order in which torch adds depends on the processor.
+        # Not `mean`: the order in which torch adds depends on the processor.
         maps -= sum(maps[i] for i in self.reference) / len(self.reference)
         self.drawn = None
 
     def findings(self) -> list[str]:
-        """Return the smallest and the largest gain with the names of the photographs."""
+        """Return a line with the smallest and the largest gain and their photographs."""
         gains = {name: _gain(self.map_of(name)) for name in self.names}
         low, high = min(gains, key=lambda n: gains[n]), max(gains, key=lambda n: gains[n])
         return [
@@ -135,7 +135,7 @@ class Exposure(Component):
         return self.deviations.state_dict()
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore what `state_dict` returned."""
+        """Restore a state of `state_dict`."""
         self.deviations.load_state_dict(state)
 
 
@@ -154,7 +154,7 @@ def apply_map(image: Tensor, colors: Tensor) -> Tensor:
 
 
 class _ApplyMap(torch.autograd.Function):
-    # Products are written out, and sums over pixels are in double: the order in which torch adds
+    # Without matrix products, and with sums over pixels in double: the order in which torch adds
     # depends on the processor and on the number of threads.
     @staticmethod
     def forward(ctx: Any, image: Tensor, colors: Tensor) -> Tensor:
@@ -172,7 +172,7 @@ class _ApplyMap(torch.autograd.Function):
 
 
 def _weighted(image: Tensor, weights: Tensor) -> Tensor:
-    """The weighted sum [H, W] of the three channels."""
+    """Return the weighted sum [H, W] of the three channels."""
     first, second, third = (image[..., i] * weights[i] for i in range(3))
     return first + second + third
 

@@ -1,4 +1,4 @@
-"""A guard against floaters: Gaussians in the empty space close to a camera."""
+"""Removal of floaters: Gaussians in the empty space close to a camera."""
 
 from __future__ import annotations
 
@@ -23,29 +23,28 @@ if TYPE_CHECKING:
     from xrgs.splat.settings import DensifySettings
 
 _NEAREST = 0.01
-"""The share of a view's SfM points that are nearer than its near depth. A minimum would be the
-depth of an outlier of SfM."""
+"""Quantile of the SfM points' depths that is a view's near depth; the minimum may be an outlier."""
 
 
 class Floaters(Component):
-    """Keeps Gaussians out of the empty space between the cameras and the scene.
+    """Removes Gaussians from the empty space between the cameras and the scene.
 
-    A Gaussian close to a camera covers much of the camera's image and little of any other image.
-    Training may put one there to lower the loss of that view alone, and it hides the scene from
-    test views near by. Let z_iv be the depth of Gaussian i in training view v, and q_v the 1st
-    percentile of the depths of the SfM points that project into the image of v. Gaussian i is
-    removed if its mean projects into the image of any training view v with
+    A Gaussian close to a camera covers much of that camera's image and little of any other. Such a
+    Gaussian can lower the loss of one view, and hides the scene from nearby test views. Let z_iv be
+    the depth of Gaussian i in training view v, and q_v the 1st percentile of the depths of the SfM
+    points that project into the image of v. Gaussian i is removed if its mean projects into the
+    image of any training view v with
 
         0 < z_iv < near_share q_v.
 
-    Gaussians are removed at step 0, at every multiple of `splat.densify.every`, after densification
-    too, and at the last step. They are removed from the model rather than left out of the renders
-    of v, because test views have no limit of their own: they would still show them. The training
-    views guard a test view among them, since their near spaces overlap.
+    Gaussians are removed at step 0, at every multiple of `splat.densify.every`, also after
+    densification, and at the last step. Hiding them in v would not help test views, which would
+    still show them. The training views also protect a test view between them, since their empty
+    spaces overlap.
 
-    The whole of it is our choice.
+    The component is our choice.
 
-    Masks are not read: the space before the scene is empty at hidden pixels too. A view without an
+    Masks are not read: the space before the scene is empty at masked pixels too. A view without an
     SfM point in its image has no limit.
     """
 
@@ -67,9 +66,9 @@ class Floaters(Component):
         self.settings, self.densify = settings, densify
         self.cameras = {view.name: view.camera for view in views}
         self.near = {name: _near(points, camera) for name, camera in self.cameras.items()}
-        """The 1st percentile of the depths of each view's SfM points, world units."""
+        """View name -> q_v, the 1st percentile of the depths of its SfM points, world units."""
         self.removed = 0
-        """The number of Gaussians that have been removed for their depth."""
+        """Number of Gaussians that this component has removed."""
 
     @classmethod
     def from_settings(cls, settings: FloatersConf, setup: TrainingSetup) -> Self | None:
@@ -84,7 +83,7 @@ class Floaters(Component):
         return cls(settings, setup.data.train, setup.data.points, setup.splat.densify)
 
     def to_prune(self, gaussians: Gaussians, step: Step) -> Tensor | None:
-        """Return which Gaussians [N] are nearer to a training view than its limit, where due."""
+        """Return the Gaussians [N] that are too close to a training view; None if not due."""
         every = self.densify.scaled(step.total).every
         due = step.number % every == 0 or step.number == step.total - 1
         if not due:
@@ -99,23 +98,23 @@ class Floaters(Component):
         return too_near
 
     def findings(self) -> list[str]:
-        """Return how many Gaussians have been removed."""
+        """Return a line with the number of removed Gaussians."""
         return [f"floaters: {self.removed} Gaussians close to a camera were removed"]
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the number of removed Gaussians; all else follows from the views and the step."""
+        """Return the number of removed Gaussians, the only state."""
         return {"removed": self.removed}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore what `state_dict` returned."""
+        """Restore a state of `state_dict`."""
         self.removed = int(state["removed"])
 
 
 def _near(points: Tensor, camera: Camera) -> float:
-    """The 1st percentile of the depths of the points [P, 3] in a view's image; 0 of none."""
+    """Return the 1st percentile of the depths of the points [P, 3] in the image; 0 without any."""
     _, _, depth, inside = camera.in_image(points)
     if not inside.any():
         return 0.0
-    # One of the depths, since the last digits of an interpolation may depend on the processor.
+    # Not interpolated, since the last digits of an interpolation may depend on the processor.
     near: float = torch.quantile(depth[inside], _NEAREST, interpolation="lower").item()
     return near

@@ -1,4 +1,4 @@
-"""How LR photographs were made, learned: the width of their blur."""
+"""The blur of LR photographs, as trained parameters."""
 
 from __future__ import annotations
 
@@ -16,39 +16,37 @@ if TYPE_CHECKING:
     from xrgs.training.components.base import Step, TrainingView
 
 BOX = math.sqrt(1 / 12)
-"""Standard deviation of a box as wide as a pixel, px: what a sensor's pixel blurs at the least."""
+"""Standard deviation of a box of one pixel, px: the least blur, by the area of a sensor's pixel."""
 
 
 class BlurWidths:
-    """The standard deviations of the blur of LR photographs, down and across, which are learned.
+    """The standard deviations, along y and x, of the blur of LR photographs, which are trained.
 
-    A photograph is blurred by the lens, by motion, and by the area of its pixels, and a variant
-    knows none of that. The render S of a view, at k times the size of its photograph, is brought
-    down by
+    A photograph is blurred by the lens, by motion and by the area of its pixels, all of them
+    unknown. The render S of a view, k times as large as the photograph, is downsampled by
 
         D(S) = R G(sigma) S,
 
-    where R is the antialiased bicubic resampling of `supersampled`, and G(sigma) a Gaussian with a
-    standard deviation for each axis, in px of the photograph (`xrgs.splat.resample.resize`). The
-    kernel of R has no second moment, so sigma is nearly all the blur of the photograph: 0.83 px
-    where a Gaussian of 0.8 px comes before the box of a pixel, of 0.85 px together. R damps the
-    highest frequencies like the box alone, for which sigma goes to 0.
+    where R is the antialiased bicubic resampling of `supersampled`, and G(sigma) a Gaussian blur
+    with a standard deviation for each axis, in px of the photograph (`xrgs.splat.resample.resize`).
+    The second moment of R's kernel is 0, so sigma is nearly the whole blur of the photograph. For
+    example, a Gaussian of 0.8 px and the box of a pixel, 0.85 px together, give a sigma of 0.83 px.
+    R damps the highest frequencies like the box, so for the box without other blur sigma goes to 0.
 
-    Each sigma begins at a pixel's box, sqrt(1/12) px, and its logarithm is learned by Adam
-    [kingma2015] at the rate `lr`, with `prior` times the square of log(sigma / box) in the loss.
-    The prior holds widths that photographs say nothing about. With `widths=tag` the LR views share
-    a pair of widths, with `widths=view` each LR view has its own, which moves at steps on that view
-    alone. HR views have none, or splats and widths could become sharper together.
+    Each sigma starts at the box of a pixel, sqrt(1/12) px. Adam [kingma2015] trains its logarithm
+    at the rate `lr`, with `prior` times the square of log(sigma / box) in the loss. The prior
+    decides where the photographs do not. With `widths=tag` all LR views share a pair of widths;
+    with `widths=view` each LR view has its own, updated only at its steps. HR views have none:
+    otherwise Gaussians and widths could become sharper together.
 
-    BAGS [peng2024] learns a kernel for each pixel by a network; one Gaussian for all views, its
+    BAGS [peng2024] trains a network for a kernel at each pixel; one Gaussian for all views, its
     start and its prior are our choice.
 
-    `formation.sigma_x` and `formation.sigma_y` record the widths of the step's view, across and
-    down.
+    `formation.sigma_x` and `formation.sigma_y` record the widths of the step's view along x and y.
     """
 
     def __init__(self, settings: FormationConf, views: Sequence[TrainingView]) -> None:
-        """Start with a pixel's box.
+        """Start with the box of a pixel.
 
         Args:
             settings: `components.formation` of the config.
@@ -57,15 +55,15 @@ class BlurWidths:
         self.settings = settings
         shared = settings.widths == "tag"
         self.rows = {view.name: 0 if shared else row for row, view in enumerate(views)}
-        """The row of each view's widths."""
+        """View name -> row of its widths in `logs`."""
         count = len(set(self.rows.values()))
         self.logs = RowAdam(torch.full((count, 2), math.log(BOX), dtype=torch.float64))
-        """The logarithms of the widths, down and across [R, 2]."""
+        """Natural logarithms of the widths along y and x [R, 2]."""
         self.drawn: Tensor | None = None
-        """The logarithms of the step's view [2], which get the gradient."""
+        """Log widths of the step's view [2], on which the gradient accumulates."""
 
     def of(self, name: str) -> tuple[float, float]:
-        """Return the widths of a view, down and across, px of its photograph."""
+        """Return the widths of a view along y and x, px of its photograph."""
         down, across = self.logs.values[self.rows[name]].exp().float().tolist()
         return down, across
 
@@ -73,17 +71,17 @@ class BlurWidths:
         """Return the variances [2] of the blur of the step's view, px^2 of its render.
 
         Args:
-            step: The step, on an LR view. Its log gets the widths where gradients are enabled.
-            factor: How many times larger than the photograph the render is.
+            step: The step, on an LR view. If gradients are enabled, its log records the widths.
+            factor: Size of the render over the size of the photograph.
         """
         logs = self.logs.values[self.rows[step.view.name]].clone()
-        if torch.is_grad_enabled():  # other renders are looked at, and teach nothing
+        if torch.is_grad_enabled():  # not for other components' renders
             self.drawn = logs.requires_grad_()
             step.log["formation.sigma_y"], step.log["formation.sigma_x"] = self.of(step.view.name)
         return (factor * logs.exp()).square()
 
     def learn(self, step: Step) -> None:
-        """Move the widths of the step's view, after the backward pass."""
+        """Update the widths of the step's view, after the backward pass."""
         if self.drawn is None or self.drawn.grad is None:
             return
         logs = self.drawn.detach()
@@ -94,7 +92,7 @@ class BlurWidths:
         self.drawn = None
 
     def findings(self) -> list[str]:
-        """Return the widths, or the smallest and the largest where each view has its own."""
+        """Return a line with the widths; with `widths=view`, with the smallest and the largest."""
         if not self.rows:
             return []
         blurs = {name: math.hypot(*self.of(name)) / math.sqrt(2) for name in self.rows}
@@ -112,5 +110,5 @@ class BlurWidths:
         return self.logs.state_dict()
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore what `state_dict` returned."""
+        """Restore a state of `state_dict`."""
         self.logs.load_state_dict(state)

@@ -1,4 +1,4 @@
-"""Gradient scaling for Gaussian radii [xrgs, section 5.3]."""
+"""Gradient scaling of the Gaussians' scales in LR views [xrgs, section 5.3]."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ if TYPE_CHECKING:
 
 
 class GradientScaling(Component):
-    """Scales the gradients that LR views give to the log-scales of the Gaussians.
+    """Multiplies the gradients of the Gaussians' log scales in LR views by a factor.
 
     Section 5.3 of the paper, with alpha = 0.3 found by grid search:
 
         grad_LR sigma <- alpha grad_LR sigma
 
-    Our choice where the paper is silent: sigma is the parameter that is trained, the natural log of
-    the scales, and the factor applies after backward and before the optimizer. The gradients of
-    means, quaternions, opacities and colours stay as they are, and so does the image-plane gradient
-    that densification reads.
+    Our choice where the paper is silent: sigma is the trained parameter, the natural log of the
+    scales, and the factor is applied between the backward pass and the optimizer. The gradients of
+    means, quaternions, opacities and colours and the image-plane gradient for densification are not
+    changed.
     """
 
     def __init__(self, settings: GradientScalingConf) -> None:
-        """Take alpha, dimensionless, from the settings."""
+        """Read alpha, a dimensionless factor, from the settings."""
         self.lr_scale = settings.lr_scale
 
     @classmethod
@@ -37,10 +37,10 @@ class GradientScaling(Component):
         return None if settings.lr_scale == 1 else cls(settings)
 
     def after_backward(self, gaussians: Gaussians, step: Step) -> None:
-        """Multiply the gradient of the log-scales by `lr_scale` in an LR view.
+        """Multiply the gradient of the log scales by `lr_scale` in an LR view.
 
-        `gradient_scaling.norm_<tag>` records the norm of the gradient before that: it shows which
-        views move the scales.
+        `gradient_scaling.norm_<tag>` records the norm of the gradient before the factor: it shows
+        which views change the scales most.
         """
         gradient = gaussians.scales.grad
         if gradient is None:

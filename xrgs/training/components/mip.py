@@ -25,11 +25,12 @@ if TYPE_CHECKING:
     from xrgs.splat.gaussians import ActivatedGaussians, Gaussians
 
 MARGIN = 0.15
-"""Fraction of the image's size by which a centre may lie outside the image and count as seen."""
+"""Fraction of the image's size by which a Gaussian's mean may lie outside and still count as
+seen."""
 
 
 class Mip(Component):
-    """Limits the detail of Gaussians to what the finest training view that sees them resolves.
+    """Limits the detail of each Gaussian to the resolution of the finest view that sees it.
 
     Mip-Splatting [yu2024, section 4.1] renders each Gaussian k convolved with an isotropic
     Gaussian, the 3D smoothing filter:
@@ -37,26 +38,24 @@ class Mip(Component):
         Sigma_k <- Sigma_k + (s / nu_k^2) I,
         o_k <- o_k sqrt(|Sigma_k| / |Sigma_k + (s / nu_k^2) I|)
 
-    so that its integral stays the same. nu_k, in px per world unit, is the highest sampling rate
-    f_i / z_ik of a view i that sees it, with focal length f_i in px and depth z_ik in world units.
-    s is `variance`, in px^2; Mip-Splatting's is 0.2. Visibility is tested with a margin of 15% of
-    the image, as in the authors' code.
+    so that its integral is unchanged. nu_k, in px per world unit, is the highest sampling rate
+    f_i / z_ik of the views i that see the Gaussian, with focal length f_i in px and depth z_ik in
+    world units. s is `variance`, in px^2; Mip-Splatting's is 0.2. Visibility is tested with a
+    margin of 15% of the image, as in the authors' code.
 
     Our choice for mixed resolution: nu_k is the maximum of f_i / z_ik over the views. The authors'
-    code divides the largest focal length of all views by the nearest distance. Both are the same
-    where all focal lengths are equal; with LR and HR views the authors' code combines the distance
-    of one view with the focal length of another. The XR-GS paper has no such filter.
+    code divides the largest focal length of all views by the nearest distance, which is the same
+    only if all focal lengths are equal: with LR and HR views it may combine the distance of one
+    view with the focal length of another. The XR-GS paper has no such filter.
 
-    The rates are computed anew whenever Gaussians were added or removed, and every `every` steps,
+    The rates are computed anew after Gaussians were added or removed, and every `every` steps,
     since means move; the authors' code does the latter only after densification. As in that code, a
     Gaussian that no view sees gets the lowest rate of the seen Gaussians, densification reads the
     parameters without the filter, and a reset caps the opacities with the filter. If no Gaussian is
-    seen, nothing is filtered. The filter becomes part of the scales and opacities that are
-    evaluated and saved.
+    seen, there is no filter. Evaluated and saved scales and opacities include the filter.
 
-    The rates are those of the photographs. `supersampled`, `formation` and `resolution_schedule`
-    render other sizes, which changes nothing in what a photograph resolves, and nothing in the
-    filter.
+    The rates are those of the photographs, also with `supersampled`, `formation` and
+    `resolution_schedule`, which render at other sizes.
 
     Attributes:
         variance: [N] variance of each Gaussian's filter, s / nu_k^2, in world units squared.
@@ -64,7 +63,7 @@ class Mip(Component):
     """
 
     def __init__(self, settings: MipConf, views: Sequence[TrainingView], near: float) -> None:
-        """Take the cameras and masks; `on_gaussians_changed` computes the filter.
+        """Store cameras and masks; `on_gaussians_changed` computes the filter.
 
         Args:
             settings: `components.mip` of the config.
@@ -101,11 +100,11 @@ class Mip(Component):
         return lowered
 
     def on_gaussians_changed(self, gaussians: Gaussians) -> None:
-        """Compute the filter of the Gaussians as they are now."""
+        """Compute the filter for the present Gaussians."""
         self._update_variance(gaussians.means)
 
     def before_render(self, activated: ActivatedGaussians, step: Step) -> ActivatedGaussians:
-        """Apply the filter to scales and opacities; gradients do not reach the filter itself.
+        """Apply the filter to scales and opacities; it is a constant for the gradients.
 
         `mip.sigma` records the mean standard deviation, in world units, and `mip.unseen` the number
         of Gaussians that no view sees.
@@ -126,19 +125,19 @@ class Mip(Component):
             gaussians.opacities.double().sigmoid(),
             self.variance.double(),
         )
-        # An opacity outside the range of float32 must not become an infinite logit.
+        # Clamped so that no logit is infinite in float32.
         bounds = torch.finfo(torch.float32)
         logits = torch.logit(opacities.clamp(bounds.tiny, 1 - bounds.eps))
-        # In place: the optimizer goes on with these tensors, and with their moments.
+        # In place, so that the optimizer keeps its tensors and their moments.
         gaussians.scales.copy_(scales.log())
         gaussians.opacities.copy_(logits)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the filter, of the means at the step when it was computed."""
+        """Return the filter, which is not recomputed from the present means."""
         return {"variance": self.variance}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore what `state_dict` returned."""
+        """Restore a state of `state_dict`."""
         self.variance = state["variance"].to(self.variance.device)
 
     def _update_variance(self, means: Tensor) -> None:
@@ -147,12 +146,12 @@ class Mip(Component):
         self.unseen_count = int((~seen).sum())
         lowest = rates[seen].min() if seen.any() else rates.new_tensor(torch.inf)
         variance = self.strength / torch.where(seen, rates, lowest).square()
-        # Above 0: `smooth` would compute 0 / 0 for a scale of 0.
+        # Above 0, since `smooth` would compute 0 / 0 for a scale of 0.
         self.variance = variance.clamp_min(torch.finfo(variance.dtype).tiny)
 
 
 def smooth(scales: Tensor, opacities: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
-    """Convolve Gaussians with isotropic ones, and keep their integrals [yu2024, section 4.1].
+    """Convolve Gaussians with isotropic ones, with the same integrals [yu2024, section 4.1].
 
     Args:
         scales: [N, 3] standard deviations in world units, above 0.
@@ -160,11 +159,11 @@ def smooth(scales: Tensor, opacities: Tensor, variance: Tensor) -> tuple[Tensor,
         variance: [N] variances of the isotropic Gaussians, in world units squared.
 
     Returns:
-        The scales [N, 3], `sqrt(scales^2 + variance)`, and the opacities [N] times the square root
-        of the ratio of the determinants of the covariances, before over after.
+        Scales [N, 3], `sqrt(scales^2 + variance)`, and opacities [N], multiplied by the square root
+        of the determinant of the covariance before over that after.
     """
     wider = rounded_sqrt(scales * scales + variance[:, None])
-    # One ratio per axis, since the product of three small scales underflows.
+    # Ratios of single axes, since the product of three small scales underflows.
     ratio = scales / wider
     return wider, opacities * ratio[:, 0] * ratio[:, 1] * ratio[:, 2]
 
@@ -174,19 +173,19 @@ def sampling_rates(
 ) -> Tensor:
     """Compute the highest sampling rate of each point among the views that see it.
 
-    A view sees a point whose depth is above `near` and whose projection lies on the image or within
-    15% of the image's size outside it. The pixel nearest to the projection must be one that the
-    view's mask uses. The rate is the larger of fx and fy over the depth.
+    A view sees a point if its depth is above `near`, its projection lies inside the image or within
+    15% of the image's size outside it, and the nearest pixel is used by the view's mask. The rate
+    is the larger of fx and fy over the depth.
 
     Args:
         means: [N, 3] points, world units.
         cameras: The cameras of the views.
         near: Depth below which a point is not seen, world units.
-        masks: The masks of the views [H, W] bool, None for a view without one; empty where no view
-            has one.
+        masks: The masks of the views [H, W] bool, None for a view without a mask; empty if no view
+            has a mask.
 
     Returns:
-        [N] rates in px per world unit, 0 where no view sees the point.
+        [N] rates in px per world unit, 0 if no view sees the point.
     """
     highest = means.new_zeros(len(means))
     for camera, mask in zip_longest(cameras, masks):
@@ -200,7 +199,7 @@ def sampling_rates(
 
 
 def _shown(mask: Tensor, K: Tensor, x: Tensor, y: Tensor, depth: Tensor) -> Tensor:
-    """Whether the pixels nearest to the projections of points [N] are used."""
+    """Return for each of N projected points whether the mask uses the nearest pixel."""
     row, column = (
         (K[axis, axis] * place / depth + K[axis, 2]).floor().long().clamp(0, size - 1)
         for axis, place, size in ((1, y, mask.shape[0]), (0, x, mask.shape[1]))

@@ -1,4 +1,4 @@
-"""Fewer Gaussians after densification, by a push on all opacities [deng2025gns]."""
+"""Fewer Gaussians after densification, by a constant gradient on all opacities [deng2025gns]."""
 
 from __future__ import annotations
 
@@ -20,54 +20,54 @@ if TYPE_CHECKING:
     from xrgs.splat.gaussians import Gaussians
 
 _LOWEST_LIVE_LOGIT = math.log(0.001 / 0.999)
-"""Gaussians with an opacity below 0.001 are removed [deng2025gns]."""
+"""Gaussians with a lower logit, an opacity below 0.001, are removed [deng2025gns]."""
 _ADJUST_EVERY = 100
-"""Steps of a 30,000-step run between two adjustments of the push [deng2025gns]."""
+"""Steps of a 30,000-step run between two adjustments of g [deng2025gns]."""
 _LEAD = 1_000
-"""Steps of a 30,000-step run by which the path of the opacities ends early [deng2025gns]."""
+"""Steps of a 30,000-step run from the end of the opacity's path to `until` [deng2025gns]."""
 _START, _TOLERANCE, _LESS, _MORE = 0.8, 0.1, 0.8, 1.2
-"""The path starts at this share of the opacity; outside this tolerance around the path the push is
-multiplied by one of the factors [deng2025gns]."""
+"""Start of the path, as a fraction of the opacity; tolerance around the path; factors of g below
+and above it [deng2025gns]."""
 _CLOSE = 1.05
-"""From this many times the budget on, the rest is removed at once [deng2025gns]."""
+"""At or below this multiple of the budget, the excess is removed at once [deng2025gns]."""
 
 
 class NaturalSelection(Component):
-    """Lowers all opacities alike after densification, and removes the Gaussians that fade.
+    """Lowers all opacities after densification, and removes the Gaussians that fade.
 
-    Gradient-driven natural selection [deng2025gns]. From the end of densification on, the gradient
-    of every logit opacity has the same constant g added,
+    Gradient-driven natural selection [deng2025gns]. From the end of densification on, the same
+    constant g, the push, is added to the gradient of every logit opacity,
 
         d L / d logit_i  +  g,
 
-    so that a Gaussian keeps its opacity where the photographs resist with a gradient of their own,
-    and fades where they do not. Gaussians with an opacity below 0.001 are removed, the most
-    transparent first, until the budget is met. Within 5% of the budget, or at step `until`, the
-    most transparent Gaussians beyond the budget are removed at once, and training goes on without
-    the push.
+    so that a Gaussian keeps its opacity where the gradient of the loss resists, and fades where it
+    does not. Gaussians with an opacity below 0.001 are removed, the most transparent first, until
+    the budget is met. Within 5% of the budget, or at step `until`, the most transparent Gaussians
+    beyond the budget are removed at once, and training continues without g.
 
-    g follows a path, as in the authors' code. With B the budget, the opacity of the B-th most
-    opaque Gaussian, the last one to keep, shall fall linearly from 0.8 of its first value to 0, and
-    reach 0 at 1,000 steps of 30,000 before `until`. Every 100 such steps g is multiplied by 0.8 if
-    that opacity is more than 10% below the path, and by 1.2 if it is more than 10% above it.
+    g is adjusted so that an opacity follows a path, as in the authors' code. With budget B, the
+    opacity of the B-th most opaque Gaussian, the last one to keep, is to fall linearly from 0.8 of
+    its first value to 0 at 1,000 steps before `until`. Every 100 steps g is multiplied by 0.8 if
+    that opacity is more than 10% below the path, and by 1.2 if it is more than 10% above it. Steps
+    are those of a 30,000-step run.
 
-    Ours, where the authors' code differs:
+    Differences from the authors' code:
 
-    - g begins as the mean absolute gradient of the logit opacities in the first step, so that no
-      unit of the image or the scene has to be tuned to. The authors' g is the gradient of a
-      quadratic term with a weight of 2e-4.
-    - g is added at every step, not at every 50th with four times the learning rate. Adam divides by
-      the root of the second moment. If a Gaussian's own gradients are small beside g, a constant is
-      worth a full step of the learning rate, 0.05 of logit: enough for 13 units of logit in 270
-      steps. A pulse at every 50th step would be worth a seventh of that.
-    - Opaque Gaussians are not pushed harder in the first 1,000 steps.
+    - g starts as the mean absolute gradient of the logit opacities in the first step, and so needs
+      no tuning to the image or the scene. The authors' g is the gradient of a quadratic term with a
+      weight of 2e-4.
+    - g is added at every step. The authors add it at every 50th step, at four times the learning
+      rate. Adam divides by the root of the second moment: if a Gaussian's other gradients are small
+      compared with g, a constant g moves a logit by the learning rate of 0.05 at each step, or 13
+      in 270 steps; a pulse at every 50th step moves it by a seventh of that.
+    - Opaque Gaussians get no larger g in the first 1,000 steps.
 
-    The budget is in Gaussians for each pixel of the largest training view, like
-    `splat.densify.budget`. If densification left no more Gaussians, nothing happens.
+    The budget is per pixel of the largest training view, like `splat.densify.budget`. If
+    densification ends within the budget, the component changes nothing.
     """
 
     def __init__(self, settings: NaturalSelectionConf, budget: int, stop: int) -> None:
-        """Take the schedule.
+        """Set the schedule.
 
         Args:
             settings: `components.natural_selection` of the config.
@@ -79,7 +79,7 @@ class NaturalSelection(Component):
         self.push = 0.0
         """g, in units of the gradient; 0 before the first step of the selection."""
         self.first_opacity = 0.0
-        """Where the path starts: a share of the opacity of the last Gaussian to keep."""
+        """Start of the path: a fraction of the opacity of the last Gaussian to keep."""
         self.done = False
         """Whether the budget has been met."""
 
@@ -88,8 +88,8 @@ class NaturalSelection(Component):
         """Build the component; a `budget` of 0 leaves it off.
 
         Raises:
-            XrgsError: The budget is below 0, `drop_every` below 1, or the selection would end
-                before densification does or after the run.
+            XrgsError: The budget is below 0, `drop_every` below 1, or `until` is before the end of
+                densification plus 1,000 steps, or after the run.
         """
         check_not_negative("components.natural_selection.budget", settings.budget)
         if settings.budget == 0:
@@ -109,7 +109,7 @@ class NaturalSelection(Component):
     def after_backward(self, gaussians: Gaussians, step: Step) -> None:
         """Add the push to the gradient of the logit opacities.
 
-        `natural_selection.push` records it, in units of the gradient.
+        `natural_selection.push` records the push, in units of the gradient.
         """
         gradient = gaussians.opacities.grad
         if self.done or step.nominal < self.start or gradient is None:
@@ -131,7 +131,7 @@ class NaturalSelection(Component):
         step.log["natural_selection.push"] = self.push
 
     def to_prune(self, gaussians: Gaussians, step: Step) -> Tensor | None:
-        """Return which Gaussians [N] have faded, or at the end of the selection the excess."""
+        """Return the faded Gaussians [N]; at the end of the selection, those beyond the budget."""
         excess = len(gaussians) - self.budget
         if self.done or step.nominal < self.start or excess <= 0:
             return None
@@ -148,22 +148,22 @@ class NaturalSelection(Component):
         return {"push": self.push, "first_opacity": self.first_opacity, "done": self.done}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore what `state_dict` returned."""
+        """Restore a state of `state_dict`."""
         self.push, self.first_opacity = float(state["push"]), float(state["first_opacity"])
         self.done = bool(state["done"])
 
     def _last_survivors_opacity(self, gaussians: Gaussians) -> float:
-        """The opacity of the last Gaussian to keep."""
+        """Return the opacity of the last Gaussian to keep."""
         rank = len(gaussians) - self.budget + 1  # from the most transparent one, 1
         logit = gaussians.opacities.detach().kthvalue(rank).values.item()
         return 1 / (1 + math.exp(-logit))
 
     def _share_left(self, step: Step) -> float:
-        """The share of the path's first opacity that is left at a step."""
+        """Return the path's opacity at a step, as a fraction of its first value."""
         done = (step.nominal - self.start) / (self.until - _LEAD - self.start)
         return max(0.0, 1 - done)
 
 
 def _is_due(step: Step, every: int) -> bool:
-    """Whether the step is the first one in a period of `every` nominal steps."""
+    """Return whether a step is the first one in a period of `every` steps of a 30,000-step run."""
     return step.nominal // every != (step.number - 1) * NOMINAL_STEPS / step.total // every

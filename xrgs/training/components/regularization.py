@@ -15,25 +15,25 @@ if TYPE_CHECKING:
 
 
 class Regularization(Component):
-    """Adds penalties to the loss, so that Gaussians fade and shrink where no photograph resists.
+    """Penalises opacities and scales, so that Gaussians without effect on the loss fade and shrink.
 
-    3DGS-MCMC [kheradmand2024], as gsplat's trainer has them: to the loss of every step,
+    The penalties of 3DGS-MCMC [kheradmand2024], as in gsplat's trainer. At every step
 
         opacity * (mean of all opacities)  +  scale * (mean of all scales on all axes)
 
-    is added, opacities in 0..1 and scales in world units. `MCMCStrategy` lives on Gaussians that
-    fade; the penalties work with other strategies too.
+    is added to the loss, for opacities in 0..1 and scales in world units. `MCMCStrategy` relocates
+    faded Gaussians, so it needs the penalties; they work with other strategies too.
 
-    Our choice: weights of the loss of LR views (`Weighting`) do not apply to the penalties.
+    Our choice: the loss weights of LR views (`Weighting`) do not multiply the penalties.
     """
 
     def __init__(self, settings: RegularizationConf, backend: str) -> None:
-        """Take the weights, and the backend that computes opacities and scales."""
+        """Store the weights, and the backend of the activation functions."""
         self.settings, self.backend = settings, backend
 
     @classmethod
     def from_settings(cls, settings: RegularizationConf, setup: TrainingSetup) -> Self | None:
-        """Build the component; two weights of 0 leave it off.
+        """Build the component; it is off if both weights are 0.
 
         Raises:
             XrgsError: A weight is below 0.
@@ -48,7 +48,7 @@ class Regularization(Component):
         activated = gaussians.activated(backend=self.backend)
         for name, values in (("opacity", activated.opacities), ("scale", activated.scales)):
             if weight := getattr(self.settings, name):
-                # In double, since the sums of float32 depend on how torch adds.
+                # In double, since float32 sums depend on the order in which torch adds.
                 mean = values.mean(dtype=torch.float64)
                 step.log[f"regularization.{name}"] = mean.to(values.dtype).item()
                 loss = loss + (weight * mean).to(loss)

@@ -21,18 +21,18 @@ if TYPE_CHECKING:
 class RenderScale(Component):
     """Renders LR views with larger Gaussians.
 
-    Section 5.7 of the paper scales the Gaussians by the camera resolution R at render time:
+    Section 5.7 of the paper scales the Gaussians by the camera resolution R when rendering:
 
         sigma' = k(R) sigma
 
     Our choice where the paper is silent: `k = (R_max / R)^gamma`, where R is the longer side of the
-    view in px, so that turning a camera by 90 degrees changes nothing, and R_max is R of the
-    largest training view. LR views that were degraded at full size have k = 1. Only LR views are
-    scaled, as in section 6.3. The paper gives no values; gamma 0.25 makes k 1.5 at factor 5.
+    view in px (the same for portrait and landscape), and R_max is R of the largest training view.
+    LR views degraded at full size have k = 1. Only LR views are scaled, as in section 6.3. The
+    paper gives no values; gamma 0.25 makes k 1.5 at factor 5.
 
-    The scales in world units are multiplied for the render alone: the log-scales get the gradients
-    of the scaled Gaussians. The Gaussians that are optimised, evaluated and saved stay as they are.
-    The paper found that it blurs; it is off in the full system.
+    The scales in world units are multiplied only for the render, and gradients reach the log scales
+    through the factor. Optimised, evaluated and saved Gaussians are not scaled. The paper found
+    that it blurs, and leaves it out of the full system.
     """
 
     def __init__(self, settings: RenderScaleConf, views: Sequence[TrainingView]) -> None:

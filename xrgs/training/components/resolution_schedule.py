@@ -20,40 +20,40 @@ if TYPE_CHECKING:
     from xrgs.training.dataset import LoadedView
 
 _LARGEST_FACTOR = 8
-"""As in the authors' code."""
+"""Largest factor of downsampling, as in the authors' code."""
 
 
 class ResolutionSchedule(Component):
-    """Trains HR views at a resolution that grows with the step, by their frequency content.
+    """Trains HR views at a resolution that grows with the step, according to their frequencies.
 
-    DashGaussian [chen2025dash] trains on photographs that are brought down by a factor r, which
-    falls to 1 as training goes on. With F_n the discrete Fourier transform of photograph n, the
-    share of the photographs that a factor keeps is
+    DashGaussian [chen2025dash] trains on photographs downsampled by a factor r, which falls to 1
+    during training. With F_n the discrete Fourier transform of photograph n, the fraction of the
+    spectrum that remains after downsampling by r is
 
         kept(r) = X(1 / (2 r)) / X(1 / 2)
         X(f) = sum_n sum_{|fx| <= f, |fy| <= f} |F_n(fx, fy)|
 
-    with fx and fy in cycles per px of each photograph, summed over channels too; n goes over the HR
-    views. In the authors' code the step at which r is reached is proportional to the logarithm of
-    kept(r): step 0 for the first r, with kept(r) of a quarter, and the step `until`, the end of
-    densification, for r = 1. r is rounded down to a whole number, at most 8. So at step t the
-    photographs are brought down by the largest whole number k with
+    with fx and fy in cycles per px of each photograph; the sum is over channels and HR views n. In
+    the authors' code the step at which r is reached is proportional to the logarithm of kept(r),
+    from step 0 for the r with kept(r) = 1/4 to `until`, the end of densification, for r = 1. r is
+    rounded down to a whole number, at most 8. So at step t the photographs are downsampled by the
+    largest whole number k with
 
         kept(k) >= start_share^(1 - t / until)
 
-    and not at all from `until` on. The camera has the smaller size, round(W / k) x round(H / k) px.
-    Densification reads normalised device units, which do not depend on the size.
+    and from `until` on they have full size. The camera has the reduced size, round(W / k) x
+    round(H / k) px. Densification is not affected: its normalised device units do not depend on
+    the size.
 
     Our choice:
 
-    - LR views are never reduced.
-    - The antialiased bicubic kernel reduces the photographs, in place of a cut in the frequency
-      domain.
-    - Every HR view keeps at least the pixels of the window of SSIM.
-    - The growth of the number of Gaussians, which the authors schedule too, is left as it is.
+    - LR views are not downsampled.
+    - Photographs are downsampled with the antialiased bicubic kernel, not in the frequency domain.
+    - Every HR view remains at least as large as the SSIM window.
+    - The growth of Gaussians, which the authors schedule too, is not changed.
 
-    The authors let the rate of the means wait until k is 1; `splat.optimizer.means_decay_from` does
-    so here.
+    In the authors' code the learning rate of means decays only after k has reached 1; here
+    `splat.optimizer.means_decay_from` sets this.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class ResolutionSchedule(Component):
         views: Sequence[TrainingView],
         backend: str = "torch",
     ) -> None:
-        """Compute the share of the spectrum that each factor keeps.
+        """Compute the fraction of the spectrum that remains at each factor.
 
         Args:
             settings: `components.resolution_schedule` of the config.
@@ -85,7 +85,7 @@ class ResolutionSchedule(Component):
         self.kept = kept_shares((view.image for view in high), range(1, largest + 1))
         self.factor = 1
         self.reduced: Mapping[str, TrainingView] = {}
-        """The views at the present factor; empty where it is 1."""
+        """Name -> HR view downsampled by the present factor; empty if the factor is 1."""
 
     @classmethod
     def from_settings(cls, settings: ResolutionScheduleConf, setup: TrainingSetup) -> Self | None:
@@ -106,7 +106,7 @@ class ResolutionSchedule(Component):
     def training_views(
         self, views: Mapping[str, TrainingView], step: Step
     ) -> Mapping[str, TrainingView]:
-        """Return the HR views at the size of this step, and the others as they are.
+        """Return the HR views at their size at this step, and the LR views unchanged.
 
         A step on an HR view records k as `resolution_schedule.factor`.
         """
@@ -127,13 +127,13 @@ class ResolutionSchedule(Component):
         return self.reduced
 
     def factor_at(self, step: Step) -> int:
-        """Return k at a step."""
+        """Return the factor k at a step."""
         left = max(0.0, 1 - step.nominal / self.settings.until)
         needed = self.settings.start_share**left
         return max(factor for factor, kept in self.kept.items() if kept >= needed)
 
     def _reduce(self, view: TrainingView, factor: int) -> TrainingView:
-        """Return an HR view with fewer pixels; its `need` is that of the view with all of them."""
+        """Downsample an HR view; its `supersampling` remains that of the full size."""
         width, height = round(view.camera.width / factor), round(view.camera.height / factor)
         image = resize(view.image, height, width, backend=self.backend)
         camera = view.camera.resized(width, height)
@@ -145,15 +145,15 @@ class ResolutionSchedule(Component):
 
 
 def kept_shares(images: Iterable[Tensor], factors: Iterable[int]) -> dict[int, float]:
-    """Compute the share of the spectra's magnitude that downsampling keeps.
+    """Compute the fraction of the spectra's magnitude that remains after downsampling.
 
     Args:
         images: Photographs [H, W, 3] of any sizes.
         factors: Whole factors of downsampling, at least 1.
 
     Returns:
-        For each factor the share in 0..1 of the sum of magnitudes, over all images, whose
-        frequencies are at most 1 / (2 factor) cycles per px on both axes; to 6 digits.
+        Factor -> fraction in 0..1: the sum of magnitudes over all images at frequencies of at most
+        1 / (2 factor) cycles per px on both axes, over the sum at all frequencies; 6 digits.
     """
     total, sums = 0.0, dict.fromkeys(factors, 0.0)
     for image in images:
@@ -163,6 +163,5 @@ def kept_shares(images: Iterable[Tensor], factors: Iterable[int]) -> dict[int, f
         for factor in sums:
             rows, columns = fy <= 0.5 / factor, fx <= 0.5 / factor
             sums[factor] += spectrum[rows][:, columns].sum().item()
-    # To 6 digits, so that the last digits of the Fourier transforms, which depend on the processor,
-    # decide nothing.
+    # Rounded to 6 digits: the last digits of the Fourier transforms depend on the processor.
     return {factor: round(value / total, 6) if total else 1.0 for factor, value in sums.items()}

@@ -1,4 +1,4 @@
-"""Views rendered as their photographs were formed: larger, and then brought down."""
+"""Rendering of coarse views at a larger size, then downsampling as the photograph was."""
 
 from __future__ import annotations
 
@@ -26,40 +26,38 @@ if TYPE_CHECKING:
 
 
 class Supersampled(Component):
-    """Renders coarse views at a larger size, and brings the render down as the photograph was.
+    """Renders coarse views at a larger size, and downsamples the render as the photograph was.
 
-    The photograph of a coarse view is I = D(S): a finer image S of the same camera, brought down by
-    a kernel D. gsplat [ye2025] renders the view at the size of I, where the filter of
-    `splat.raster.eps2d`, 0.3 px^2 of that size, is many times as large in pixels of a finer view.
-    Here the view v is rendered at k_v times the width and height, and
+    The photograph of a coarse view is I = D(S): a finer image S of the same camera, downsampled by
+    a kernel D. gsplat [ye2025] renders the view at the size of I, where the dilation
+    `splat.raster.eps2d` of 0.3 px^2 is a large area in pixels of a finer view. Here view v is
+    rendered at k_v times the width and height, and its loss is
 
-        loss = L(D(render_k), I),    k_v = clamp(round(need_v), 1, factor)
+        L(D(render_k), I),    k_v = clamp(round(need_v), 1, factor).
 
-    is the loss of the view. need_v says how many times as many pixels a side the view would need to
-    be as fine as the finest views of what it sees (`xrgs.mixture.sampling_rate.needed_factors`):
-    about 1 for an HR view, which stays as it is, and about `variant.factor` for a degraded one. The
-    view's tag does not count: photographs that are hardly a mixture are all rendered at their own
-    size.
+    need_v is the factor of width and height at which the view would be as fine as the finest views
+    of the same content (`xrgs.mixture.sampling_rate.needed_factors`): about 1 for an HR view, and
+    about `variant.factor` for a degraded view. The tag does not matter: if all photographs have
+    nearly the same resolution, all are rendered at their own size.
 
-    D is the kernel by which the variant has made its LR views:
+    D is the kernel that made the variant's LR views:
 
-    - `downsample`, and other degradations that make a view smaller: antialiased bicubic to the size
-      of I;
-    - `digital_zoom`: the same to the size between, which is the size that I resolves, and bicubic
-      up again; the render is k times as large as the size between.
+    - `downsample`, and other degradations to a smaller size: antialiased bicubic to the size of I;
+    - `digital_zoom`: the same to the intermediate size, which is the resolution of I, then bicubic
+      upsampling; the render is k times as large as the intermediate size.
 
-    For all other views it is the mean of k x k pixels, since a pixel of a sensor averages over its
+    For all other views D is the mean of k x k pixels, since a pixel of a sensor averages over its
     area.
 
-    With `components.formation`, D is learned for LR views in place of that (`BlurWidths`), and acts
-    where k is 1 too; a digital zoom comes after it.
+    With `components.formation`, D is trained for LR views instead (`BlurWidths`), also for k = 1; a
+    digital zoom is applied after it.
 
-    `late_factor` takes the place of `factor` from step `late_from` on, so that a run may begin or
-    end with direct renders. Densification reads the image-plane gradients of the larger render in
-    normalised device units, which do not depend on its size. The evaluation is untouched.
+    From step `late_from` on, `late_factor` replaces `factor`, so that a run may begin or end with
+    renders at the photographs' size. Densification reads image-plane gradients in normalised device
+    units, which do not depend on the size of the render. The evaluation is not changed.
 
-    Our choice: the whole component; super-resolution of 3D Gaussian Splatting trains through a
-    downsampled render too [feng2024srgs], but on LR views alone.
+    Our choice: the whole component. Super-resolution of 3D Gaussian Splatting also trains through a
+    downsampled render [feng2024srgs], but only on LR views.
     """
 
     def __init__(
@@ -72,20 +70,20 @@ class Supersampled(Component):
         *,
         blur: FormationConf,
     ) -> None:
-        """Find out how photographs were formed, and log how many views have each k.
+        """Choose the kernels D, and log how many views have each k.
 
         Args:
             settings: `components.supersampled` of the config.
             views: All training views.
-            degradation: What was done to LR views, `Dataset.degradation`.
-            zoom: With `digital_zoom`, how many times fewer px per side a photograph resolves.
+            degradation: How LR views were made, `Dataset.degradation`.
+            zoom: Factor of the digital zoom: size of a photograph over its resolution.
             backend: `torch` or `native`: the implementation of the resampling.
             blur: `components.formation` of the config.
         """
         self.settings = settings
         self.backend = backend
         self.shrinks = degradation not in ("jpeg", "none")
-        """Whether LR views resolve fewer pixels than the photographs that they were made of."""
+        """Whether the degradation reduces the resolution of LR views."""
         self.zoom = zoom if degradation == "digital_zoom" else 1
         low = [view for view in views if view.tag == "LR"]
         self.blur = BlurWidths(blur, low) if blur.widths != "none" else None
@@ -93,7 +91,7 @@ class Supersampled(Component):
 
     @classmethod
     def from_settings(cls, settings: SupersampledConf, setup: TrainingSetup) -> Self | None:
-        """Build the component; factors of 1 with no `formation.widths` leave it off.
+        """Build the component; it is off if all factors are 1 and `formation.widths` is `none`.
 
         Raises:
             XrgsError: A value is out of its range.
@@ -112,7 +110,7 @@ class Supersampled(Component):
         return cls(settings, data.train, data.degradation, data.factor, setup.backend, blur=blur)
 
     def render_camera(self, camera: Camera, step: Step) -> Camera:
-        """Return the camera at k times the size that the photograph resolves."""
+        """Return the camera at k times the photograph's resolution."""
         factor = self._factor(step)
         if factor == 1 and not self._is_blurred(step):
             return camera
@@ -121,7 +119,7 @@ class Supersampled(Component):
         return small.resized(small.width * factor, small.height * factor)
 
     def to_photograph(self, image: Tensor, step: Step) -> Tensor:
-        """Bring the render [kH, kW, 3] of a view down to its photograph's size [H, W, 3]."""
+        """Downsample the render [kH, kW, 3] of a view to its photograph's size [H, W, 3]."""
         factor, blur = self._factor(step), self.blur if self._is_blurred(step) else None
         if factor == 1 and blur is None:
             return image
@@ -136,13 +134,13 @@ class Supersampled(Component):
         return resize(image, camera.height, camera.width, backend=self.backend)
 
     def after_backward(self, gaussians: Gaussians, step: Step) -> None:
-        """Move the widths of the blur of the step's photograph."""
+        """Update the blur widths of the step's photograph."""
         del gaussians
         if self.blur is not None:
             self.blur.learn(step)
 
     def findings(self) -> list[str]:
-        """Return how many views have each k, and the widths of the blur that were learned."""
+        """Return lines with the number of views for each k, and the trained blur widths."""
         return [self._factors(), *(self.blur.findings() if self.blur is not None else ())]
 
     def state_dict(self) -> dict[str, Any]:
@@ -150,12 +148,12 @@ class Supersampled(Component):
         return {} if self.blur is None else self.blur.state_dict()
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore what `state_dict` returned."""
+        """Restore a state of `state_dict`."""
         if self.blur is not None:
             self.blur.load_state_dict(state)
 
     def _factor(self, step: Step) -> int:
-        """Return k at a step on a view."""
+        """Return k of the step's view."""
         late = step.nominal >= self.settings.late_from
         settings = self.settings
         return _clamped(step.view.supersampling, settings.late_factor if late else settings.factor)
@@ -164,13 +162,13 @@ class Supersampled(Component):
         return self.blur is not None and step.view.tag == "LR"
 
     def _resolved(self, camera: Camera, step: Step) -> Camera:
-        """Return the camera of a view at the size of the pixels that its photograph resolves."""
+        """Return the camera at the resolution of the photograph, smaller than it after a zoom."""
         if self.zoom == 1 or step.view.tag == "HR":
             return camera
         return camera.resized(camera.width // self.zoom, camera.height // self.zoom)
 
     def _factors(self) -> str:
-        """Return how many views have each k, and from `late_from` on, where that differs."""
+        """Return a text: the number of views for each k, first and, if different, late."""
         settings = self.settings
         early, late = (
             ", ".join(f"{count} at {k}" for k, count in sorted(counts.items()))
@@ -189,7 +187,7 @@ def _clamped(need: float, factor: int) -> int:
 
 def _block_means(image: Tensor, side: int) -> Tensor:
     """Average the blocks of `side` x `side` pixels of an image [side * H, side * W, 3]."""
-    # Written out: the order in which torch's pooling adds depends on the processor.
+    # Not torch's pooling: the order in which it adds depends on the processor.
     total = image.new_zeros(())
     for y in range(side):
         for x in range(side):

@@ -15,16 +15,17 @@ def gradient_magnitude(image: Tensor) -> Tensor:
 
         g = sqrt(mean over channels of (d_x^2 + d_y^2)).
 
-    The unit of length is a pixel. So g measures detail near the image's own limit of resolution: in
-    an LR view it indicates detail beyond that limit.
+    The unit of length is a pixel, so g measures detail near the limit of the image's resolution. In
+    an LR view, a large g indicates that detail is missing.
 
-    Our choice where the paper is silent: section 7.2 only says "via Fourier or gradient magnitude".
+    Our choice where the paper is silent: section 7.2 says only "via Fourier or gradient magnitude".
 
     Args:
         image: [H, W, 3] in 0..1, at least 2 x 2 px.
 
     Returns:
-        [H, W] intensity per px, at most sqrt(2); the last row and column repeat the ones before.
+        [H, W] intensity per px, at most sqrt(2); the last row and column are copies of their
+        neighbours.
     """
     inner = image[:-1, :-1]
     squared = (image[:-1, 1:] - inner).square() + (image[1:, :-1] - inner).square()
@@ -34,16 +35,17 @@ def gradient_magnitude(image: Tensor) -> Tensor:
 
 
 def mean_gradient(image: Tensor, mask: Tensor | None) -> float:
-    """Average `gradient_magnitude` over an image [H, W, 3], or over the used pixels of a mask.
+    """Average `gradient_magnitude` over an image, or over the used pixels of its mask.
 
-    Of these count the pixels whose two neighbours are used too, since their differences are known.
+    A used pixel counts only if its right and lower neighbours are used too, since the differences
+    read them.
 
     Args:
         image: [H, W, 3] in 0..1, at least 2 x 2 px.
-        mask: [H, W] bool, True for a pixel that is used; None uses all.
+        mask: [H, W] bool, True for a used pixel; None uses all.
 
     Returns:
-        Intensity per px; 0 where no pixel counts.
+        Intensity per px; 0 if no pixel counts.
     """
     magnitude = gradient_magnitude(image)
     if mask is None:

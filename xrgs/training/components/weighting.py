@@ -1,7 +1,7 @@
-"""The weight of a view in the loss, by every setting that changes it [xrgs, 5.2 and 7.2].
+"""The weight of a view in the loss [xrgs, sections 5.2 and 7.2].
 
-`Weighting` is the component. The functions below it give the weight of a view and its attenuations,
-one for each key of the config that `Weighting` reads.
+`Weighting` is the component. Each function below it computes a weight or an attenuation for one
+key of the config.
 """
 
 from __future__ import annotations
@@ -35,36 +35,36 @@ if TYPE_CHECKING:
     from xrgs.splat.gaussians import Gaussians
 
 WINDOW = 5
-"""Side, in px, of the square over which the texture of a pixel is averaged."""
+"""Side of the square over which the texture of a pixel is averaged, px."""
 NEAREST_POINTS = 5
-"""Number of SfM points whose median depth is the depth of a pixel."""
+"""Number of nearest SfM points whose median depth is the depth of a pixel."""
 
 ViewWeight = Callable[[TrainingView], float]
-"""The lowest weight of a view, which its resolution alone gives."""
+"""Function: view -> its lowest weight, in 0..1, which depends only on its resolution."""
 Attenuation = Callable[[Step], float]
-"""The share, in 0..1, of the reduction `1 - view_weight` that applies at a step."""
+"""Function: step -> the fraction, in 0..1, of the reduction `1 - view_weight` that applies."""
 
 _STATISTICS = ("weighted", "unweighted")
 
 
 class Weighting(Component):
-    """Multiplies the loss of a view, and with it its gradients, by the weight of the view.
+    """Multiplies the loss of a view, and so its gradients, by the weight of the view.
 
         weight = view_weight + (1 - view_weight) (1 - a_1 a_2 ...)
 
-    `view_weight` is the weight by tag of loss weighting (`weight_by_tag`), or the weight by
-    sampling rate of continuous weighting in its place (`weight_by_sampling_rate`). Each attenuation
-    a in 0..1 comes from adaptive weighting (`scene_attenuation`), the hybrid schedule
-    (`scheduled_attenuation`) or region weighting (`region_attenuations`): 1 applies the whole
-    reduction, 0 none of it.
+    `view_weight` is the weight by tag of loss weighting (`weight_by_tag`), or, if that is on, the
+    weight by sampling rate of continuous weighting (`weight_by_sampling_rate`). The attenuations a
+    in 0..1 come from adaptive weighting (`scene_attenuation`), the hybrid schedule
+    (`scheduled_attenuation`) and region weighting (`region_attenuations`). An attenuation of 1
+    applies the whole reduction, 0 none.
 
-    Our choice where the paper is silent: the paper proposes these separately. We multiply the
-    attenuations, so that any of them can be combined, no view weighs less than its `view_weight`,
-    and none weighs more than 1.
+    Our choice where the paper is silent: the paper proposes these methods separately. We multiply
+    the attenuations, so that methods can be combined and every weight is between `view_weight` and
+    1.
 
-    Region weighting has an attenuation for every pixel. `weight` is then the mean over the view's
-    pixels, and `pixel_weights` distributes it over them. The weight of each view whose
-    `view_weight` is not 1 is recorded as `weighting.<tag>`.
+    Region weighting has an attenuation for every pixel. Then `weight` is the mean over the view's
+    pixels, and `pixel_weights` distributes it over them. `weighting.<tag>` records the weight of
+    each view whose `view_weight` is not 1.
     """
 
     def __init__(
@@ -78,14 +78,14 @@ class Weighting(Component):
         """Combine a weight with its attenuations.
 
         Args:
-            view_weight: Gives the weight of a view, in 0..1.
-            attenuations: Each gives the attenuation at a step, in 0..1.
-            regions: Attenuations [H, W] in 0..1 of the pixels, by the names of the views.
-            stat_from: `weighted`, or `unweighted` if densification is to read image-plane gradients
-                without the weights.
+            view_weight: Returns the lowest weight of a view, in 0..1.
+            attenuations: Functions that return an attenuation at a step, in 0..1.
+            regions: View name -> attenuations of its pixels [H, W], in 0..1.
+            stat_from: `weighted`, or `unweighted` for image-plane gradients without weights in
+                densification.
 
         Raises:
-            XrgsError: `stat_from` is neither.
+            XrgsError: `stat_from` has another value.
         """
         if stat_from not in _STATISTICS:
             raise XrgsError(
@@ -101,16 +101,16 @@ class Weighting(Component):
     def from_settings(cls, settings: LossWeightingConf, setup: TrainingSetup) -> Self | None:
         """Build the component from `loss_weighting` and the settings that change its weight.
 
-        It is off where every view has weight 1: `lr_weight` is 1, and the `gamma` of continuous
+        The component is off if every view has weight 1: `lr_weight` is 1, and `gamma` of continuous
         weighting is 0.
 
         Raises:
-            XrgsError: A setting is out of its range, or attenuates a weight that is off.
+            XrgsError: A setting is out of range, or attenuates weights that are all 1.
         """
         conf, data = setup.components, setup.data
         _check_ranges(conf)
         view_weight: ViewWeight
-        if conf.continuous_weighting.gamma != 0:  # in place of the tag where both are set
+        if conf.continuous_weighting.gamma != 0:  # it replaces the weight by tag
             view_weight = partial(weight_by_sampling_rate, gamma=conf.continuous_weighting.gamma)
         elif settings.lr_weight != 1:
             view_weight = partial(weight_by_tag, lr_weight=settings.lr_weight)
@@ -131,23 +131,23 @@ class Weighting(Component):
         return cls(view_weight, attenuations, regions, stat_from=settings.stat_from)
 
     def weight(self, step: Step) -> float:
-        """Return the weight of the step's view, the mean over its pixels."""
+        """Return the weight of the step's view: the mean over its pixels."""
         region_mean = self.region_means.get(step.view.name, 1.0)
         view_weight = self.view_weight(step.view)
         return view_weight + (1 - view_weight) * (1 - self._attenuation(step) * region_mean)
 
     def pixel_weights(self, step: Step) -> Tensor | None:
-        """Return the weights [H, W] of the pixels over their mean; None where all are equal."""
+        """Return the pixels' weights divided by their mean [H, W]; None if all are equal."""
         region = self.regions.get(step.view.name)
         mean = self.weight(step)
-        # A mean of 0 leaves nothing to distribute: every pixel has weight 0.
+        # With a mean of 0 every pixel has weight 0.
         if region is None or mean == 0:
             return None
         view_weight = self.view_weight(step.view)
         return (view_weight + (1 - view_weight) * (1 - self._attenuation(step) * region)) / mean
 
     def modify_loss(self, loss: Tensor, image: Tensor, gaussians: Gaussians, step: Step) -> Tensor:
-        """Return `loss * weight`, or `loss` itself where the weight is 1."""
+        """Return `loss * weight`, or `loss` itself if the weight is 1."""
         del image, gaussians
         weight = self.weight(step)
         if self.view_weight(step.view) != 1:
@@ -155,7 +155,7 @@ class Weighting(Component):
         return loss if weight == 1 else loss * weight
 
     def densification_grad2d(self, grad2d: Tensor, step: Step) -> Tensor:
-        """Return the gradient divided by the view's weight where `stat_from` is `unweighted`."""
+        """Return the gradient, divided by the view's weight if `stat_from` is `unweighted`."""
         weight = self.weight(step)
         if self.stat_from == "weighted" or weight in {0, 1}:
             return grad2d
@@ -172,14 +172,14 @@ def weight_by_tag(view: TrainingView, lr_weight: float) -> float:
 
         L = 1.0 L_base for an HR view, 0.25 L_base for an LR view.
 
-    The weight scales the view's image-plane gradients too, and so changes what is densified. Adam
-    [kingma2015] divides a gradient by its recent size, so that parameters which only LR views reach
-    move as fast as without a weight. The weight decides where LR and HR views reach the same
-    parameters, and what is densified.
+    The weight has two effects. It scales the view's image-plane gradients, and so changes which
+    Gaussians grow. And it balances LR and HR views where both see the same Gaussians. Gaussians
+    that only LR views see move as fast as without a weight, since Adam [kingma2015] divides a
+    gradient by its recent size.
 
     Our choice where the paper is silent: densification reads the gradients of the weighted loss
-    (`stat_from: weighted`), as the formula has it. With `stat_from: unweighted` it reads the
-    gradients without the weight; a weight of 0 leaves no gradient to read.
+    (`stat_from: weighted`), following the formula. With `stat_from: unweighted` it reads the
+    gradients without the weight, which does not work for a weight of 0.
 
     Args:
         view: The view.
@@ -189,21 +189,21 @@ def weight_by_tag(view: TrainingView, lr_weight: float) -> float:
 
 
 def weight_by_sampling_rate(view: TrainingView, gamma: float) -> float:
-    """Weight a view by its sampling rate, `rho ** gamma`, whatever its tag [xrgs, conclusion].
+    """Weight a view of either tag by its sampling rate, `rho ** gamma` [xrgs, conclusion].
 
     `rho`, in (0, 1], is the sampling rate of the view (focal length in px over the median depth of
     the scene) divided by the highest rate of all views. For synthetic LR views it is about
-    1 / factor; for real photographs it follows from focal length and distance. A view that was
-    degraded without shrinking it has the rate of its size in pixels.
+    1 / factor; for real photographs it depends on focal length and distance. For a view degraded at
+    full size, it is the rate of the full size.
 
     Our choice where the paper is silent: the conclusion proposes "a continuous, texture-aware
     weighting scheme" and gives no formula. The power law is ours. gamma = 0.86, log 4 / log 5,
-    gives an LR view at factor 5 the paper's weight of 0.25. (As a power of the number of pixels,
-    which goes with rho squared, it would be 0.43.)
+    gives an LR view at factor 5 the paper's weight of 0.25. (For a power of the number of pixels,
+    which is proportional to rho squared, gamma would be 0.43.)
 
     Args:
         view: The view.
-        gamma: The power.
+        gamma: The exponent.
     """
     return float(view.sampling_rate**gamma)
 
@@ -212,15 +212,15 @@ def scene_attenuation(views: Sequence[TrainingView], texture: float) -> float:
     """Attenuate LR views in proportion to the texture of the scene [xrgs, 7.2, proposal 1].
 
     Adaptive weighting: the attenuation is `min(1, g / texture)`, where g is the mean of
-    `gradient_magnitude` over all used pixels of all LR views. A flat scene, whose LR views lack no
-    detail, is not attenuated at all; from `texture` on the attenuation is complete.
+    `gradient_magnitude` over all used pixels of all LR views. It is 0 for a flat scene, whose LR
+    views lack no detail, and 1 from g = `texture` on.
 
     Our choice where the paper is silent: section 7.2 proposes to "estimate image texture (e.g., via
     Fourier or gradient magnitude) and increase LR weighting when the scene is globally
-    low-frequency", without measure or weights. Measure, ramp and threshold are ours. `texture` 0.07
-    lies between the LLFF scenes that the paper calls cluttered (fern, flower, horns: 0.074 to 0.12
-    at factor 5 of 504 and 1008 px) and the simple ones (fortress 0.055; a single object 0.03 to
-    0.04).
+    low-frequency", without a measure or weights. Measure, ramp and threshold are ours. `texture` of
+    0.07 is between g of the LLFF scenes that the paper calls cluttered (fern, flower, horns: 0.074
+    to 0.12 at factor 5 of 504 and 1008 px) and of the simple ones (fortress 0.055; a single object
+    0.03 to 0.04).
 
     Args:
         views: All training views.
@@ -234,12 +234,12 @@ def scene_attenuation(views: Sequence[TrainingView], texture: float) -> float:
 def scheduled_attenuation(step: Step, start: float, ramp: float) -> float:
     """Attenuate LR views until densification stops, then less and less [xrgs, 7.2, proposal 3].
 
-    The hybrid schedule: the attenuation is 1 until `start` and falls linearly to 0 over the `ramp`
-    steps that follow.
+    The hybrid schedule: the attenuation is 1 until `start` and falls linearly to 0 over the next
+    `ramp` steps.
 
     Our choice where the paper is silent: section 7.2 proposes to "reintroduce LR influence in late
-    training stages" and names no step. We start where densification ends: from there on LR views
-    can refine the Gaussians that HR views have shaped, and cannot create new ones.
+    training stages" and names no step. We start at the end of densification: from then on LR views
+    can refine the Gaussians that HR views have shaped, but can't create new ones.
 
     Args:
         step: The step.
@@ -254,13 +254,13 @@ def region_attenuations(
 ) -> Mapping[str, Tensor]:
     """Attenuate textured parts of LR views that an HR view covers [xrgs, 7.2, proposal 2].
 
-    Region weighting: the attenuation of a pixel is `min(1, g / texture)` where an HR view covers it
-    (`coverage`), and 0 elsewhere, where g is `gradient_magnitude` averaged over 5 x 5 px. Smooth
-    regions, and regions that no HR view sees, keep the full weight of LR supervision.
+    Region weighting: with g, `gradient_magnitude` averaged over 5 x 5 px, the attenuation of a
+    pixel is `min(1, g / texture)` if an HR view covers it (`coverage`), else 0. Smooth regions, and
+    regions that no HR view sees, keep the full weight.
 
     Our choice where the paper is silent: section 7.2 proposes "spatially varying loss/gradient
     scaling so smooth regions retain LR supervision while textured regions benefit from XR-GS
-    attenuation". The measure, its window and the condition of coverage are ours; `texture` is 0.07,
+    attenuation". The measure, its window and the condition of coverage are ours; `texture` is 0.07
     as in adaptive weighting.
 
     Args:
@@ -270,7 +270,7 @@ def region_attenuations(
         near: Depth below which a point is not seen, world units.
 
     Returns:
-        Attenuations [H, W] in 0..1, by the name of each LR view.
+        Name of each LR view -> attenuations [H, W] in 0..1.
     """
     hr_cameras = [view.camera for view in views if view.tag == "HR"]
     low = [view for view in views if view.tag == "LR"]
@@ -280,10 +280,10 @@ def region_attenuations(
 
 @dataclass(frozen=True)
 class _RegionAttenuation:
-    """Computes the attenuation of a view from what is slow to find out."""
+    """Computes the attenuations of a view from its coverage, which is cached since it is slow."""
 
     covered: Mapping[str, Tensor]
-    """Whether an HR view covers each pixel [H, W], by the names of the views."""
+    """Name of each LR view -> [H, W] bool, whether an HR view covers the pixel."""
     texture: float
 
     def __call__(self, view: TrainingView) -> Tensor:
@@ -291,8 +291,8 @@ class _RegionAttenuation:
         attenuation = share.clamp_max(1.0) * self.covered[view.name].to(share.device)
         if view.mask is None:
             return attenuation
-        # Outside there is no loss to attenuate; with the mean of the inside, the mean of the view
-        # is the mean over its used pixels.
+        # Pixels outside the mask have no loss. Filled with the mean of the used pixels, they do not
+        # change the mean of the view.
         inside = rounded_mean(attenuation[view.mask])
         return attenuation.where(view.mask, attenuation.new_tensor(inside))
 
@@ -302,8 +302,8 @@ def coverage(camera: Camera, others: Sequence[Camera], points: Tensor, near: flo
 
     The depth of a pixel is the median depth of the five SfM points that project nearest to it. The
     pixel is covered if its point at that depth projects into one of the other views, at more px per
-    world unit than in its own. Occlusion is not tested, since a few points per view cannot separate
-    the two sides of a depth edge: what an object hides from every other view counts as covered.
+    world unit than in its view. Occlusion is not tested, since a few points per view can't resolve
+    depth edges: content that an object hides from every other view counts as covered.
 
     Args:
         camera: The view.
@@ -321,8 +321,8 @@ def coverage(camera: Camera, others: Sequence[Camera], points: Tensor, near: flo
     K = camera.K.to(points)
     rays = torch.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], torch.ones_like(x)], -1)
     viewmat = camera.viewmat.to(points)
-    # The product with the transposed rotation, written out, since the order in which torch adds
-    # depends on the processor.
+    # The product with the transposed rotation, without a matrix product, since the order in which
+    # torch adds depends on the processor.
     at_depth = (rays * depth[:, None] - viewmat[:3, 3])[..., None] * viewmat[:3, :3]
     world = at_depth[:, 0] + at_depth[:, 1] + at_depth[:, 2]  # [H W, 3]
     covered = torch.zeros(len(world), dtype=torch.bool)
@@ -334,7 +334,7 @@ def coverage(camera: Camera, others: Sequence[Camera], points: Tensor, near: flo
 
 
 def _pixel_depths(camera: Camera, points: Tensor, near: float) -> Tensor | None:
-    """The depth of each pixel [H W] in row-major order; None where no point is in view."""
+    """Return the depth of each pixel [H W], in row-major order; None if no point is in view."""
     pixels, z = _project(camera, points)
     seen = (z > near) & _inside(pixels, camera)
     count = int(seen.sum())
@@ -347,13 +347,13 @@ def _pixel_depths(camera: Camera, points: Tensor, near: float) -> Tensor | None:
 
 
 def _pixel_centres(camera: Camera) -> Tensor:
-    """The centres [H W, 2] of the pixels, x and y, in row-major order."""
+    """Return the centres [H W, 2] of the pixels, x and y, px, in row-major order."""
     y, x = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
     return torch.stack([x, y], dim=-1).reshape(-1, 2) + 0.5
 
 
 def _project(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
-    """The projections [P, 2] of points [P, 3], px, which need a depth above 0, and depths [P]."""
+    """Return projections [P, 2], px, and depths [P] of points [P, 3] with depths above 0."""
     K = camera.K.to(points)
     x, y, z = camera.to_camera(points)
     pixels = torch.stack([x, y], dim=-1) / z[:, None] * K[[0, 1], [0, 1]] + K[:2, 2]
@@ -361,12 +361,12 @@ def _project(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _inside(pixels: Tensor, camera: Camera) -> Tensor:
-    """Whether each of the pixels [P, 2] lies on the image."""
+    """Return whether each of the pixels [P, 2] is inside the image."""
     return ((pixels > 0) & (pixels < pixels.new_tensor([camera.width, camera.height]))).all(dim=-1)
 
 
 def _box_mean(values: Tensor, mask: Tensor | None = None) -> Tensor:
-    """The mean [H, W] over the window around each pixel, over the part inside image and mask."""
+    """Return the mean [H, W] over the pixels of each window that are inside image and mask."""
     if mask is not None:
         used = mask.to(values)
         return _box_mean(values * used) / _box_mean(used).clamp_min(torch.finfo(values.dtype).tiny)
@@ -378,7 +378,7 @@ def _box_mean(values: Tensor, mask: Tensor | None = None) -> Tensor:
 
 
 def _attenuating_settings(conf: ComponentsConf) -> dict[str, float]:
-    """The settings that attenuate a view's weight, by their keys; each is off at 0."""
+    """Return key -> setting, of the settings that attenuate a view's weight; 0 means off."""
     return {
         "components.adaptive_weighting.texture": conf.adaptive_weighting.texture,
         "components.region_weighting.texture": conf.region_weighting.texture,
@@ -395,7 +395,7 @@ def _check_ranges(conf: ComponentsConf) -> None:
 
 
 def _check_no_attenuation(conf: ComponentsConf) -> None:
-    """Refuse settings that would have no effect, because every view has weight 1."""
+    """Refuse attenuations, which would have no effect: every view has weight 1."""
     for key, value in _attenuating_settings(conf).items():
         if value != 0:
             raise XrgsError(

@@ -1,22 +1,22 @@
-"""A dense start: Gaussians on surfaces that a plane sweep of the training views finds.
+"""A dense start: first Gaussians on the scene's surfaces, from multi-view stereo.
 
-Training that starts from SfM points spends its first steps on growing Gaussians where there are
-none. A dense start spends seconds on finding the surfaces: as EDGS [kotovenko2025] does by matches
-of a network, but by classical multi-view stereo on the variant's own poses:
+Training from SfM points spends its first steps on growing Gaussians in empty regions. A dense start
+finds the surfaces in seconds. EDGS [kotovenko2025] uses matches of a network; here it is classical
+multi-view stereo with the variant's poses:
 
-1. Every view is swept by planes [collins1996] between the depths of its SfM points, evenly in
-   inverse depth, and compared with its nearest neighbours (`depths`, `matching`).
+1. A plane sweep [collins1996] compares every view with its nearest neighbours, at planes between
+   the depths of its SfM points, evenly spaced in inverse depth (`depths`, `matching`).
 2. Semi-global matching [hirschmuller2008] smooths the costs (`semiglobal`).
-3. A depth holds where neighbours have it too, and fewer views see through it (`checks`).
-4. Each place of the scene goes to the view that samples it most finely.
-5. A quadtree of each view's own pixels splits where their colours differ, until there are as many
-   leaves as the budget has; each becomes a Gaussian (`quadtree`, `surface`).
+3. A depth is kept if neighbours have it too, and more views confirm than contradict it (`checks`).
+4. Each place of the scene is assigned to the view that samples it most finely.
+5. A quadtree over the pixels assigned to each view is split where colours differ, until the number
+   of leaves reaches the budget; each leaf becomes a Gaussian (`quadtree`, `surface`).
 
-The SfM points are kept beside them. Where few depths hold or the views are hardly covered, a dense
-start would harm. It then is off by itself, and the log says so.
+The Gaussians on the SfM points are kept. A dense start would harm if few depths are consistent or
+large parts of the views are not covered: then training starts from the SfM points, with a warning.
 
-Everything is computed on the CPU in float32 and float64, with the same bits for any number of
-threads. Masks are respected, and views may have any sizes.
+All is computed on the CPU in float32 and float64, with the same bits for any number of threads.
+Masked pixels are ignored, and views may have any sizes.
 """
 
 from __future__ import annotations
@@ -37,16 +37,16 @@ if TYPE_CHECKING:
     from xrgs.training.dataset import Dataset
 
 BUDGET = 0.25
-"""The most Gaussians, for each pixel of the largest training view: 48,000 at 504 x 378 px; our
-choice."""
+"""Largest number of added Gaussians, per pixel of the largest training view: 48,000 at
+504 x 378 px; our choice."""
 OPACITY = 0.3
-"""The opacity of each Gaussian; our choice."""
+"""Opacity of each added Gaussian; our choice."""
 SCALE = 0.5
-"""The scale of each Gaussian, sides of its square; our choice."""
+"""Scale of each added Gaussian, as a multiple of the side of its square; our choice."""
 LEAST_GOOD = 0.6
-"""The least share of the views' pixels whose depths must hold; our choice."""
+"""Least fraction of the views' pixels with a consistent depth; our choice."""
 LEAST_COVERED = 0.8
-"""The least share of the views that the Gaussians must cover; our choice."""
+"""Least fraction of the views' area that the added Gaussians cover; our choice."""
 
 _log = logging.getLogger(__name__)
 
@@ -59,12 +59,12 @@ def dense_start(
     Args:
         data: The training views and the SfM points.
         sparse: The Gaussians on the SfM points.
-        backend: `torch` or `native`: what resamples photographs and compares them.
+        backend: `torch` or `native`: the implementation of resampling and of the plane sweep.
         generator: Draws the quaternions.
 
     Returns:
-        The Gaussians on SfM points, then those on surfaces; `sparse` itself where a dense start
-        would harm.
+        The Gaussians on SfM points, then those on surfaces; `sparse` itself if a dense start would
+        harm.
     """
     views = swept_views(data.train, backend)
     maps = list(find_depths(views, data.points.double().numpy(), backend).values())
@@ -84,7 +84,7 @@ def dense_start(
 
 
 def _off(sparse: Gaussians, why: str, least: float) -> Gaussians:
-    """Say why the start is from the SfM points alone, and return their Gaussians."""
+    """Log why there is no dense start, and return the Gaussians on the SfM points."""
     _log.warning(
         "splat.init=dense: off, since only %s, and at least %.0f%% are needed: training starts from"
         " the SfM points",

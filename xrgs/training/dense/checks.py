@@ -1,4 +1,4 @@
-"""Which depths hold against those of other views, and which view has a place of the scene first."""
+"""Consistency of depths between views, and assignment of each place to one view."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from xrgs.training.dense.depths import DepthMap
 from xrgs.training.dense.levels import Bools, Doubles
 
 AGREEING = 2
-"""A depth is good where this many neighbours have it too, or the one neighbour of the view; our
-choice."""
+"""Number of neighbours with the same depth that a good depth needs (1 if the view has only one
+neighbour); our choice."""
 _TOLERANCE = 1.0
-"""Depths agree where their inverse depths differ by at most this many planes of the coarser sweep.
-In front of that, a point is in space that the other view sees through; our choice."""
+"""Depths agree if their inverse depths differ by at most this many plane steps of the coarser
+sweep. The other view sees through a point that is nearer than that; our choice."""
 
 
 class _Comparison:
-    """Points of one view in the depth map of another: all arrays are [P]."""
+    """Compares points of one view with the depth map of another; all arrays are [P]."""
 
     def __init__(self, points: Doubles, step: float, other: DepthMap) -> None:
         """Project the points.
 
         Args:
             points: [P, 3] world units.
-            step: The difference of inverse depth between two planes of the points' own view.
-            other: The other view's depths.
+            step: Difference of inverse depth between two planes of the view with the points.
+            other: Depth map of the other view.
         """
         x, y, depth = other.level.project(points)
         height, width = other.good.shape
@@ -36,13 +36,13 @@ class _Comparison:
         known = inside & other.good[row, column]
         tolerance = _TOLERANCE * max(step, other.step)
         self.agrees = known & (np.abs(nearer) <= tolerance)
-        """Which points the other view has at the same depth, at a good pixel."""
+        """Whether the other view has the same depth at the point, at a good pixel."""
         self.sees_through = known & (nearer > tolerance)
-        """Which points are in front of what the other view has at a good pixel."""
+        """Whether the point is in front of the other view's depth, at a good pixel."""
 
 
 def good_points(depths: DepthMap) -> Doubles:
-    """The points [P, 3] of the good pixels of a view, world units, row by row."""
+    """Return the points [P, 3] of a view's good pixels, world units, row by row."""
     row, column = np.nonzero(depths.good)
     depth = 1 / depths.inverse_depth[row, column].astype(np.float64)
     x, y = (axis.astype(np.float64) + 0.5 for axis in (column, row))
@@ -50,11 +50,11 @@ def good_points(depths: DepthMap) -> Doubles:
 
 
 def consistent(maps: Mapping[int, DepthMap], number: int) -> Bools:
-    """Which good pixels [h, w] of a view have a depth that its neighbours have too.
+    """Return the good pixels [h, w] of a view whose depth agrees with `AGREEING` neighbours.
 
     Args:
-        maps: The depths by the numbers of the views.
-        number: The number of the view.
+        maps: Number of a view -> its depths.
+        number: Number of the view to check.
     """
     own = maps[number]
     points = good_points(own)
@@ -66,11 +66,11 @@ def consistent(maps: Mapping[int, DepthMap], number: int) -> Bools:
 
 
 def not_seen_through(maps: Mapping[int, DepthMap], number: int) -> Bools:
-    """Which good pixels [h, w] of a view more views have at the same depth than see through.
+    """Return the good pixels [h, w] with more views of the same depth than that see through.
 
     Args:
-        maps: The depths by the numbers of the views.
-        number: The number of the view.
+        maps: Number of a view -> its depths.
+        number: Number of the view to check.
     """
     own = maps[number]
     points = good_points(own)
@@ -84,13 +84,13 @@ def not_seen_through(maps: Mapping[int, DepthMap], number: int) -> Bools:
 
 
 def owned(maps: Sequence[DepthMap]) -> list[Bools]:
-    """Give each place of the scene to the first view that has it at a good pixel.
+    """Assign each place of the scene to the first view that shows it at a good pixel.
 
     Args:
-        maps: The depths of all views, those first whose pixels count first.
+        maps: The depths of all views, in the order of precedence.
 
     Returns:
-        For each view, the good pixels [h, w] that no view before it has.
+        For each view, its good pixels [h, w] that no earlier view shows.
     """
     result = []
     for place, own in enumerate(maps):
@@ -103,7 +103,7 @@ def owned(maps: Sequence[DepthMap]) -> list[Bools]:
 
 
 def _among_good(depths: DepthMap, chosen: Bools) -> Bools:
-    """The pixels [h, w] of the chosen ones [P] among the good ones."""
+    """Return the mask [h, w] of the good pixels that are `chosen` [P]."""
     pixels = np.zeros_like(depths.good)
     pixels[depths.good] = chosen
     return pixels

@@ -13,33 +13,32 @@ from xrgs.training.dense.matching import costs
 from xrgs.training.dense.semiglobal import minimum, smoothed
 
 NEIGHBOURS = 8
-"""A view is compared with the cameras nearest to it, at most as many as this; our choice."""
+"""Largest number of neighbours, the nearest cameras, that a view is compared with; our choice."""
 _LEAST_PARALLAX = 0.02
-"""Cameras nearer than this times the median depth see no parallax, and are not compared; our
-choice."""
+"""Least distance of a neighbour, as a fraction of the median depth: nearer cameras see too little
+parallax; our choice."""
 _LEAST_COSINE = 0.5
-"""Cameras are compared where their axes are at most 60 degrees apart; our choice."""
+"""Least cosine of the angle between the optical axes of neighbours: 60 degrees; our choice."""
 _LEAST_POINTS = 8
 """A view with fewer SfM points in its image is not swept; our choice."""
 _PERCENTILES = 1, 50, 99
 _MARGIN = 1.25
-"""Planes reach beyond the first and last of these percentiles of the SfM points' depths by this
-factor; our choice."""
+"""Planes extend beyond the 1st and 99th percentile of the SfM points' depths by this factor; our
+choice."""
 _STEP = 0.35
-"""How far the image of a pixel in a neighbour moves between two planes, px, in the median of the
-neighbours; our choice."""
+"""Motion of the projection into a neighbour between two planes, px, median over the neighbours; our
+choice."""
 _PLANES = 16, 128
-"""The least and the most planes of a sweep."""
+"""Least and largest number of planes of a sweep."""
 _REACH = 3, 8
-"""The least and the most planes to either side of a pixel's depth that a refinement looks at."""
+"""Least and largest number of planes on either side of a pixel's depth in a refinement."""
 _REFINEMENTS = 3
-"""A refinement bends the planes to the depths that it begins with. So each is more exact than the
-one before; our choice."""
+"""Number of refinements; each searches around the depths of the one before; our choice."""
 _WINDOW = 5
-"""The side of the window, px, whose median takes single wrong depths out after each refinement, and
-whose mean evens out the others, across no edge."""
+"""Side of the filters' window after each refinement, px: a median removes single wrong depths, then
+a mean that stops at edges smooths."""
 _LEAST_FINE = 3
-"""A fine level is compared with fine ones only where this many neighbours have one."""
+"""A fine level is compared only with fine levels if this many neighbours have one."""
 
 
 @dataclass(frozen=True)
@@ -49,11 +48,11 @@ class Planes:
     inverse_depths: Floats
     """[D] 1 / world units, from far to near, evenly spaced."""
     neighbours: list[int]
-    """The numbers of the views that it can be compared with, the nearest first."""
+    """Numbers of the views to compare it with, the nearest first."""
 
     @property
     def step(self) -> np.float32:
-        """The difference of inverse depth between two planes."""
+        """Difference of inverse depth between two planes."""
         step: np.float32 = self.inverse_depths[1] - self.inverse_depths[0]
         return step
 
@@ -66,28 +65,28 @@ class DepthMap:
     inverse_depth: Floats
     """[h, w] 1 / world units, at the view's finest level."""
     good: Bools
-    """[h, w] the pixels whose depths have passed all checks so far."""
+    """[h, w] whether the pixel's depth has passed all checks so far."""
     step: float
-    """The difference of inverse depth between two planes of the sweep."""
+    """Difference of inverse depth between two planes of the sweep."""
     neighbours: list[int]
-    """The numbers of the views that the sweep compared."""
+    """Numbers of the views that the sweep compared."""
 
     @property
     def level(self) -> Level:
-        """The level of the pixels."""
+        """The view at the resolution of the depths."""
         return self.view.finest
 
 
 def choose_planes(views: Sequence[SweptView], points: Doubles) -> dict[int, Planes]:
-    """Choose planes and neighbours.
+    """Choose the planes and neighbours of each view.
 
     Args:
         views: The views.
         points: SfM points [P, 3], world units.
 
     Returns:
-        The planes by the numbers of the views, without the views that can't be swept: few points
-        are in their image, or no other camera sees the same from another place.
+        Number of a view -> its planes. Views that can't be swept are missing: too few points are in
+        their image, or they have no neighbour.
     """
     levels = [view.coarse for view in views]
     positions = np.stack([level.position for level in levels])
@@ -119,9 +118,9 @@ def _depths_in_image(level: Level, points: Doubles) -> Doubles:
 
 
 def _displacement(level: Level, others: Sequence[Level], far: float, near: float) -> float:
-    """How far the image of the central pixel moves between two inverse depths, px, in the median.
+    """Return the motion of the central pixel's projection between two inverse depths, px.
 
-    The median is one of the views' values.
+    It is the upper median over the other views.
     """
     row, column = (size // 2 for size in level.gray.shape)
     moves = []
@@ -146,7 +145,7 @@ def sweep(
     Args:
         views: All views.
         planes: The planes of the view.
-        number: The number of the view.
+        number: Number of the view.
         backend: `native` for the compiled kernels, which give the same bits; else numpy.
     """
     view, nearest = views[number], planes.neighbours[:NEIGHBOURS]
@@ -164,7 +163,7 @@ def _refined(
     coarse: Floats,
     backend: str,
 ) -> Floats:
-    """Compare depths [h, w] about those of the coarse level on the finest one."""
+    """Refine the coarse level's depths `coarse` by searching around them on the finest level."""
     if view.fine is not None:
         fine = [other for other in neighbours if other.fine is not None]
         neighbours = fine if len(fine) >= _LEAST_FINE else neighbours
@@ -183,11 +182,11 @@ def _refined(
 
 
 def evened(image: Floats, range_: np.float32) -> Floats:
-    """The mean [h, w] of each pixel's window, over the values near its own.
+    """Smooth an image [h, w] by the mean of each pixel's window, without blurring edges.
 
     Args:
         image: [h, w]
-        range_: Values count that differ from the pixel's own by at most this.
+        range_: Largest difference from the pixel's value; other values of the window are ignored.
     """
     height, width = image.shape
     total, number = np.zeros_like(image), np.zeros_like(image)
@@ -202,7 +201,7 @@ def evened(image: Floats, range_: np.float32) -> Floats:
 
 
 def enlarged(image: Floats, height: int, width: int) -> Floats:
-    """Enlarge an image [h, w], bilinear: [height, width]."""
+    """Enlarge an image [h, w] to [height, width], bilinearly."""
     for axis, new in enumerate((height, width)):
         old = image.shape[axis]
         place = np.clip((np.arange(new) + 0.5) * old / new - 0.5, 0, old - 1)

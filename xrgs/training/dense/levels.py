@@ -1,4 +1,4 @@
-"""The training views at the sizes that the plane sweep compares them at."""
+"""The training views at the coarse and fine resolutions of the plane sweep."""
 
 from __future__ import annotations
 
@@ -18,32 +18,31 @@ Doubles = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 LEAST_SHRINK = 4
-"""The coarse level is at least this many times smaller than the largest view, where no view is as
-small; our choice."""
+"""Least ratio of the largest view's longer side to that of the coarse level; our choice."""
 _FINER = 1.5
-"""A view has a fine level where that is at least this many times as large as the coarse one."""
+"""Least ratio of a view's fine level to its coarse level; otherwise it has no fine level."""
 
 
 @dataclass(frozen=True)
 class Level:
-    """A view at one size.
+    """A view at one resolution.
 
-    Everything is computed product by product in float64, since the order in which the products of
-    matrices add depends on the processor.
+    Geometry is computed in float64 without matrix products, since the order in which these add
+    depends on the processor.
     """
 
     gray: Floats
-    """[h, w] the mean of the photograph's channels."""
+    """[h, w] mean of the photograph's channels, in 0..1."""
     used: Bools
-    """[h, w] the pixels inside the view's mask."""
+    """[h, w] whether the pixel is inside the view's mask."""
     rotation: Doubles
     """[3, 3] world to camera."""
     offset: Doubles
-    """[3] world to camera, world units."""
+    """[3] translation from world to camera, world units."""
     focal: Doubles
-    """[2] px: fx, fy."""
+    """[2] fx, fy, px."""
     centre: Doubles
-    """[2] px: cx, cy."""
+    """[2] cx, cy, px."""
 
     @property
     def position(self) -> Doubles:
@@ -52,19 +51,19 @@ class Level:
         return position
 
     def rays(self) -> tuple[Doubles, Doubles]:
-        """The rays of the pixels: x [1, w] and y [h, 1] at depth 1, camera coordinates."""
+        """Return the pixels' rays: x [1, w] and y [h, 1] at depth 1, camera coordinates."""
         height, width = self.gray.shape
         x = (np.arange(width) + 0.5 - self.centre[0]) / self.focal[0]
         y = (np.arange(height) + 0.5 - self.centre[1]) / self.focal[1]
         return x[None, :], y[:, None]
 
     def towards(self, other: Level) -> tuple[tuple[Doubles, Doubles, Doubles], Doubles]:
-        """How the rays of this view run in another view's image.
+        """Return the coefficients that project this view's pixels into another view.
 
         Returns:
-            a, three arrays [h, w], and b [3]: a pixel at inverse depth q is at
-            (a_0 + b_0 q, a_1 + b_1 q) / (a_2 + b_2 q), px of the other view. The denominator times
-            the depth is the depth in the other view.
+            a, three arrays [h, w], and b [3]. A pixel of this view at inverse depth q projects to
+            (a_0 + b_0 q, a_1 + b_1 q) / (a_2 + b_2 q), px of the other view. Its depth there is
+            (a_2 + b_2 q) / q.
         """
         turn = (other.rotation[:, None, :] * self.rotation[None, :, :]).sum(axis=2)  # [3, 3]
         shift = other.offset - (turn * self.offset).sum(axis=1)
@@ -75,14 +74,14 @@ class Level:
         return (fx * a_x + cx * a_z, fy * a_y + cy * a_z, a_z), b
 
     def to_world(self, x: Doubles, y: Doubles, depth: Doubles) -> Doubles:
-        """The points [P, 3] of pixels (x, y) [P] each at a depth [P], world units."""
+        """Return the points [P, 3] at depth [P] behind the pixels x [P], y [P], world units."""
         rays = (x - self.centre[0]) / self.focal[0], (y - self.centre[1]) / self.focal[1], 1.0
         local = [ray * depth - shift for ray, shift in zip(rays, self.offset, strict=True)]
         turn = self.rotation
         return np.stack([sum(turn[i, k] * local[i] for i in range(3)) for k in range(3)], axis=-1)
 
     def project(self, points: Doubles) -> tuple[Doubles, Doubles, Doubles]:
-        """The pixels x and y and the depths [P] of points [P, 3]; nan behind the camera."""
+        """Project points [P, 3] to x, y (px) and depth, [P] each; nan behind the camera."""
         turn, shift = self.rotation, self.offset
         x, y, z = (sum(turn[i, k] * points[:, k] for k in range(3)) + shift[i] for i in range(3))
         z = np.where(z > 0, z, np.nan)
@@ -95,28 +94,29 @@ class Level:
 
 @dataclass(frozen=True)
 class SweptView:
-    """A training view, with the levels that it is swept at."""
+    """A training view with its coarse and fine levels."""
 
     photograph: TrainingView
     coarse: Level
     fine: Level | None
-    """None where the view is hardly larger than its coarse level."""
+    """None if the view is hardly larger than its coarse level."""
 
     @property
     def finest(self) -> Level:
-        """The level that the view's depths have in the end."""
+        """The level of the view's final depths."""
         return self.coarse if self.fine is None else self.fine
 
 
 def swept_views(views: tuple[TrainingView, ...], backend: str) -> list[SweptView]:
-    """Bring every view to its levels.
+    """Resample every view to its levels.
 
-    The coarse level of all views has one longer side: the smallest of the views', and at most a
-    quarter of the largest. A view that is larger has a fine level of half its size.
+    The coarse levels of all views have the same longer side: that of the smallest view, but at most
+    a quarter of that of the largest view. A sufficiently larger view also has a fine level, of half
+    its size.
 
     Args:
         views: The training views.
-        backend: `torch` or `native`: the implementation that resamples.
+        backend: `torch` or `native`: the implementation of resampling.
     """
     sides = [max(view.camera.width, view.camera.height) for view in views]
     coarse = min(*sides, max(max(sides) // LEAST_SHRINK, 1))

@@ -1,4 +1,4 @@
-"""Compares the windows of a view with those of others, for many depths of every pixel."""
+"""Compares windows of a view with those of other views, at many depths for every pixel."""
 
 from __future__ import annotations
 
@@ -9,20 +9,21 @@ import numpy as np
 from xrgs.training.dense.levels import Bools, Floats, Level
 
 REACH = 2
-"""Windows reach this many px to each side: they are 5 x 5 px."""
+"""Half size of a window, px: windows are 5 x 5 px."""
 BEST = 4
-"""A depth's score is the mean of this many other views' correlations, the highest ones, so that a
-view in which something else hides the pixel does not count."""
+"""Number of highest correlations with other views whose mean is a depth's score, so that views with
+an occlusion do not count."""
 _NOISE = np.float32(1e-5)
-"""Added to the variances of the windows: about the variance of the noise of 8 bits, so that flat
-windows have no correlation."""
+"""Added to the variances of the windows, so that flat windows have no correlation: about the
+variance of 8-bit noise."""
 _CHUNK = 1 << 16
-"""Depths are compared for about this many pixels at once, which the processor's caches hold."""
+"""Number of (pixel, depth) pairs that are compared at once, so that they fit in the processor's
+caches."""
 _BEHIND = np.float32(1e-6)
 
 
 class Windows:
-    """An image in windows of 5 x 5 px, for its correlation with others."""
+    """The 5 x 5 px windows of an image, for correlation with those of other images."""
 
     def __init__(self, image: Floats) -> None:
         """Compute the moments of the windows.
@@ -30,18 +31,18 @@ class Windows:
         Args:
             image: [h, w] in 0..1.
         """
-        # Differences from mid-gray, since less of the variances is then lost to rounding.
+        # Centred on mid-gray, which reduces rounding errors of the variances.
         self.image = image - np.float32(0.5)
         self.share: Floats = np.float32(1) / box_sum(np.ones_like(image))
-        """1 over the number of pixels [h, w] of each window that are in the image."""
+        """[h, w] 1 over the number of the window's pixels that are inside the image."""
         self.mean, self.variance = self._moments(self.image)
 
     def zncc(self, other: Floats) -> Floats:
-        """The zero-mean normalised cross-correlation with the windows of other images.
+        """Return the zero-mean normalised cross-correlation with the windows of other images.
 
             (E[I J] - E[I] E[J]) / sqrt((Var[I] + e) (Var[J] + e)),   e = 1e-5
 
-        where E is the mean over the pixels of a window that are in the image.
+        where E is the mean over the window's pixels inside the image.
 
         Args:
             other: Images J [..., h, w] in 0..1.
@@ -56,14 +57,14 @@ class Windows:
         return correlation
 
     def _moments(self, image: Floats) -> tuple[Floats, Floats]:
-        """The mean and the variance, with the noise, of each window."""
+        """Return the mean of each window, and its variance plus `_NOISE`."""
         mean = box_sum(image) * self.share
         variance = box_sum(image * image) * self.share - mean * mean
         return mean, np.maximum(variance, 0) + _NOISE
 
 
 def box_sum(image: Floats) -> Floats:
-    """Sum images [..., h, w] over the window around each pixel; outside there are zeros."""
+    """Sum images [..., h, w] over the window around each pixel, padded with zeros."""
     across = image.copy()
     for shift in range(1, REACH + 1):
         across[..., shift:] += image[..., :-shift]
@@ -78,10 +79,10 @@ def box_sum(image: Floats) -> Floats:
 def costs(
     level: Level, others: Sequence[Level], inverse_depths: Floats, backend: str = "torch"
 ) -> Floats:
-    """How badly each pixel fits at each of its inverse depths: 1 - its score, in 0..1.
+    """Compute the matching cost of each pixel at each of its inverse depths: 1 - score, in 0..1.
 
-    The score is the mean of the `BEST` highest correlations with other views. A correlation below 0
-    counts as 0, and so does that with a view whose image the pixel is not in.
+    The score is the mean of the `BEST` highest correlations with other views. A correlation is 0 if
+    it is negative, or if the pixel projects outside the other view.
 
     Args:
         level: The view, [h, w].
@@ -103,7 +104,7 @@ def costs(
         for path in paths:
             image, inside = path.sample(inverse_depths[part])
             score = np.where(inside, windows.zncc(image), 0)
-            for best in highest:  # each takes the score if it is higher, and passes the lower on
+            for best in highest:  # insert the score into the sorted highest scores
                 lower = np.minimum(best, score)
                 np.maximum(best, score, out=best)
                 score = lower
@@ -142,21 +143,21 @@ def _parts(count: int, pixels: int) -> Iterator[slice]:
 
 
 class _Path:
-    """Where the pixels of a view are in another view, by their inverse depth."""
+    """Samples another view at the projections of a view's pixels."""
 
     def __init__(self, level: Level, other: Level) -> None:
         directions, shift = level.towards(other)
         self.directions = [direction.astype(np.float32) for direction in directions]
         self.shift = shift.astype(np.float32)
         self.other = other
-        # A row and a column more, so that the four neighbours of every place exist.
+        # Padded by a row and a column, so that bilinear sampling has four neighbours everywhere.
         self.image = np.pad(other.gray, ((0, 1), (0, 1)), mode="edge")
 
     def sample(self, inverse_depths: Floats) -> tuple[Floats, Bools]:
-        """Sample the other image where the pixels [h, w] are at their inverse depths [d, ...].
+        """Sample the other view at the projections of the pixels at inverse depths [d, ...].
 
         Returns:
-            [d, h, w] the image, bilinear, and whether the pixel is in it and inside its mask.
+            [d, h, w] bilinear samples, and whether the projection is inside image and mask.
         """
         height, width = self.other.gray.shape
         x, y, z = (
@@ -182,7 +183,7 @@ class _Path:
 
 
 def _place(position: Floats, size: int) -> tuple[np.ndarray, Floats]:
-    """The sample before a position on an axis, clamped to the image, and the share of the next."""
+    """Return the index of the sample before a position (clamped), and the weight of the next."""
     position = np.clip(position - np.float32(0.5), 0, np.float32(size - 1))
     before = position.astype(np.int32)
     return before, position - before.astype(np.float32)

@@ -1,4 +1,4 @@
-"""Squares of pixels of even colour: few where a photograph is smooth, many where it is not."""
+"""A quadtree of a photograph: large squares where it is smooth, small squares where it is not."""
 
 from __future__ import annotations
 
@@ -11,48 +11,48 @@ from numpy.typing import NDArray
 from xrgs.training.dense.levels import Bools, Doubles, Floats
 
 LEVELS = 5
-"""Squares are 1, 2, 4, ... up to 2^5 = 32 px a side; our choice."""
+"""The sides of squares are 1, 2, 4, ... up to 2^5 = 32 px; our choice."""
 
 Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
 class Leaves:
-    """Squares of one view's photograph, L of them."""
+    """L squares of one view's photograph. Only the chosen pixels of a square count."""
 
     x: Doubles
-    """[L] px, the mean place of the chosen pixels of the square."""
+    """[L] mean position of the square's pixels, px."""
     y: Doubles
     pixels: Doubles
-    """[L] their number."""
+    """[L] number of the square's pixels."""
     colors: Doubles
-    """[L, 3] in 0..1, their mean colour."""
+    """[L, 3] mean colour of the square's pixels, in 0..1."""
     nearest: tuple[Indices, Indices]
-    """[L] row and column of the chosen pixel that is nearest to the mean place."""
+    """[L] row and column of the pixel nearest to the mean position."""
 
 
 class Quadtree:
-    """All squares of the chosen pixels of one photograph, from single pixels upward."""
+    """All squares of one photograph's chosen pixels, of every size from a single pixel."""
 
     def __init__(self, image: Floats, chosen: Bools, weight: float) -> None:
-        """Sum up the squares.
+        """Compute the errors of all squares.
 
         Args:
             image: [H, W, 3] in 0..1.
-            chosen: [H, W] the P pixels that count.
-            weight: The factor of this photograph's errors.
+            chosen: [H, W] bool, the P pixels that count.
+            weight: Factor of the errors of this photograph.
         """
         self.rows, self.columns = (axis.astype(np.int64) for axis in np.nonzero(chosen))
         self.colors = image[chosen].astype(np.float64)
         self.width = chosen.shape[1]
         self.of_pixels = [self._square_of_pixels(level) for level in range(LEVELS + 1)]
-        """For each size the number [P] of the square that each pixel is in."""
+        """For each size: [P] number of the square around each pixel."""
         self.errors = [weight * self._errors(squares) for squares in self.of_pixels]
-        """For each size the squared differences of the squares' colours from their means."""
+        """For each size: sum of squared differences from the mean colour, for each square."""
 
     def _square_of_pixels(self, level: int | Indices) -> Indices:
-        """The number [P] of the square that each pixel is in, 2^level px a side."""
-        # The width is at least the number of squares in a row, whatever their size.
+        """Return the number [P] of the square around each pixel, with sides of 2^level px."""
+        # The image's width is at least the number of squares in a row, for every size.
         square: Indices = (self.rows >> level) * self.width + (self.columns >> level)
         return square
 
@@ -64,11 +64,11 @@ class Quadtree:
         return np.maximum(total, 0)
 
     def roots(self) -> int:
-        """The number of the largest squares."""
+        """Return the number of squares of the largest size."""
         return len(np.unique(self.of_pixels[LEVELS]))
 
     def splits(self) -> tuple[Doubles, Indices]:
-        """The error of each square with several pixels, and how many squares its split adds."""
+        """Return the error of each divisible square, and the number of squares a split adds."""
         errors, added = [], []
         for level in range(1, LEVELS + 1):
             _, first = np.unique(self.of_pixels[level - 1], return_index=True)
@@ -78,10 +78,10 @@ class Quadtree:
         return np.concatenate(errors), np.concatenate(added)
 
     def leaves(self, limit: float) -> Leaves:
-        """Split every square whose error is above a limit; return those that are left.
+        """Split all squares with an error above the limit; return the remaining squares.
 
-        A part of a square has no larger error than the square, so that a pixel is in the largest
-        square around it that is within the limit.
+        The error of a part is at most that of the square. So each pixel belongs to the largest
+        square around it whose error is within the limit.
         """
         level = np.zeros(len(self.rows), np.int64)
         for size in range(1, LEVELS + 1):
@@ -100,15 +100,15 @@ class Quadtree:
 
 
 def limit_for(trees: Sequence[Quadtree], budget: int) -> float:
-    """The error above which squares are split, so that they are at most as many as a budget.
+    """Return the limit for `Quadtree.leaves` that gives at most `budget` leaves of all trees.
 
-    Where the largest squares are more than the budget already, nothing is split.
+    If the largest squares alone exceed the budget, nothing is split.
     """
     parts = [tree.splits() for tree in trees]
     errors = np.concatenate([part[0] for part in parts])
     added = np.concatenate([part[1] for part in parts])
     order = np.argsort(-errors, kind="stable")
     total = sum(tree.roots() for tree in trees) + np.cumsum(added[order])
-    split = int(np.searchsorted(total, budget, side="right"))  # as many squares can be split
-    # The next one stays whole, and so do those with the same error.
+    split = int(np.searchsorted(total, budget, side="right"))  # number of squares to split
+    # The next square, and others with the same error, are not split.
     return float(errors[order[split]]) if split < len(order) else 0.0

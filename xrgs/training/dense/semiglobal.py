@@ -1,4 +1,4 @@
-"""Semi-global matching [hirschmuller2008]: the costs of depths, smoothed along lines."""
+"""Semi-global matching [hirschmuller2008]: smooths the costs of depths along lines of pixels."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import numpy as np
 from xrgs.training.dense.levels import Floats
 
 STEP = 0.015
-"""The penalty of a pixel whose depth is one plane from its neighbour's; our choice."""
+"""P1: penalty for a depth one plane from that of the neighbouring pixel; our choice."""
 JUMP = 0.2
-"""The penalty of any larger difference; our choice."""
+"""P2: penalty for any larger difference; our choice."""
 
 
 def smoothed(costs: Floats, backend: str = "torch") -> Floats:
-    """Sum the costs along the lines that lead to each pixel from left, right, above and below.
+    """Smooth the costs along the rows and columns of pixels, in both directions.
 
     Along a line, with p' the pixel before p,
 
@@ -36,7 +36,7 @@ def smoothed(costs: Floats, backend: str = "torch") -> Floats:
 
 
 def _both_ways(costs: Floats) -> Floats:
-    """The sum of L along the first axis, forward and backward, of costs [n, D, m]."""
+    """Return forward L plus backward L along the first axis of costs [n, D, m]."""
     total = np.empty_like(costs)
     path = costs[0]
     total[0] = path
@@ -60,7 +60,7 @@ def _native_both_ways(costs: Floats) -> Floats:
 
 
 def _next(path: Floats, costs: Floats) -> Floats:
-    """L of the next pixels of m lines, of L [D, m] and the pixels' costs [D, m]."""
+    """Compute L of the next pixels of m lines from L [D, m] and the next pixels' costs [D, m]."""
     least = path.min(axis=0)
     reached: Floats = np.minimum(path, least + np.float32(JUMP))
     np.minimum(reached[1:], path[:-1] + np.float32(STEP), out=reached[1:])
@@ -71,7 +71,7 @@ def _next(path: Floats, costs: Floats) -> Floats:
 
 
 def minimum(costs: Floats) -> Floats:
-    """The place of the least cost of each pixel, between planes by a parabola through three.
+    """Return the plane of the least cost of each pixel, interpolated by a parabola.
 
     Args:
         costs: [D, h, w], at least 3 planes.

@@ -1,4 +1,4 @@
-"""The surfaces of a scene, as squares of even colour at the depths of the views' pixels."""
+"""The surfaces of a scene, as squares of nearly uniform colour at the depths of the pixels."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from xrgs.training.dense.levels import Bools, Doubles, SweptView
 from xrgs.training.dense.quadtree import Quadtree, limit_for
 
 _CELLS = 24
-"""Coverage is counted in cells, this many along the longer side of a view; our choice."""
+"""Number of coverage cells along the longer side of a view; our choice."""
 
 
 @dataclass(frozen=True)
 class Squares:
-    """Squares on the surfaces of a scene, N of them."""
+    """N squares on the surfaces of a scene."""
 
     points: Doubles
-    """[N, 3] their centres, world units."""
+    """[N, 3] centres, world units."""
     colors: Doubles
     """[N, 3] in 0..1."""
     sides: Doubles
-    """[N] world units."""
+    """[N] side lengths, world units."""
 
 
 def find_depths(
     views: Sequence[SweptView], points: Doubles, backend: str = "torch"
 ) -> dict[int, DepthMap]:
-    """Sweep every view, and check its depths against those of others.
+    """Sweep every view, and check its depths against those of the other views.
 
     Args:
         views: The training views.
@@ -43,10 +43,10 @@ def find_depths(
         backend: As for `sweep`.
 
     Returns:
-        The depths by the numbers of the views, without the views that can't be swept.
+        Number of a view -> its depths. Views that can't be swept are missing.
     """
     planes = choose_planes(views, points)
-    # A thread for each view, and one thread within: the bits are the same for any number.
+    # Views run in parallel, each on one thread, so that the bits do not depend on the thread count.
     with single_torch_thread() as threads, ThreadPoolExecutor(threads) as pool:
         swept = pool.map(lambda number: sweep(views, planes[number], number, backend), planes)
         found = dict(zip(planes, progress(swept, "dense start", "view", len(planes)), strict=True))
@@ -60,14 +60,14 @@ def find_depths(
 
 
 def cover(maps: Sequence[DepthMap], budget: int) -> Squares:
-    """Cover the good pixels of all views by squares, each place of the scene once.
+    """Cover the good pixels of all views with squares, each place of the scene once.
 
-    A place belongs to the view that samples the scene most finely among those that have it. The
-    squares are the leaves of quadtrees, split where the colours of a photograph differ most.
+    A place is assigned to the view with the highest sampling rate that shows it at a good pixel.
+    The squares are the leaves of quadtrees, which are split where colours differ most.
 
     Args:
         maps: The depths of the views, with at least one good pixel among them.
-        budget: The most squares, unless the largest squares of the quadtrees are more.
+        budget: Largest number of squares. The quadtrees' largest squares may exceed it.
     """
     ordered = sorted(maps, key=lambda each: -each.view.photograph.sampling_rate)
     of_views = zip(ordered, owned(ordered), strict=True)
@@ -77,7 +77,7 @@ def cover(maps: Sequence[DepthMap], budget: int) -> Squares:
         Quadtree(
             each.view.photograph.image.numpy(),
             _on_photograph(each, pixels),
-            # Errors count by the angle that a pixel takes, so that coarse views are split too.
+            # Weighted by a pixel's solid angle, so that coarse views are split too.
             weight=(max(focal) / own) ** 2,
         )
         for (each, pixels), own in zip(having, focal, strict=True)
@@ -88,7 +88,7 @@ def cover(maps: Sequence[DepthMap], budget: int) -> Squares:
 
 
 def _on_photograph(depths: DepthMap, pixels: Bools) -> Bools:
-    """Bring pixels [h, w] of a view's finest level to the size of its photograph."""
+    """Enlarge a mask [h, w] of a view's finest level to the size of its photograph."""
     camera = depths.view.photograph.camera
     rows, columns = (
         ((np.arange(new) + 0.5) * old / new).astype(np.int64)
@@ -99,29 +99,29 @@ def _on_photograph(depths: DepthMap, pixels: Bools) -> Bools:
 
 
 def _squares(depths: DepthMap, tree: Quadtree, limit: float) -> tuple[Doubles, Doubles, Doubles]:
-    """The points, colours and sides of the leaves of a view's quadtree."""
+    """Return points, colours and sides of the leaves of a view's quadtree."""
     leaves, level, camera = tree.leaves(limit), depths.level, depths.view.photograph.camera
     height, width = depths.good.shape
-    down, across = height / camera.height, width / camera.width  # px of the level, of a px
+    down, across = height / camera.height, width / camera.width  # level px per photograph px
     row, column = (
         ((nearest + 0.5) * scale).astype(np.int64)
         for nearest, scale in zip(leaves.nearest, (down, across), strict=True)
     )
     depth = 1 / depths.inverse_depth[row, column].astype(np.float64)
     points = level.to_world(leaves.x * across, leaves.y * down, depth)
-    # The level's focal length, px of the photograph.
+    # focal[0] / across is the focal length in px of the photograph.
     sides = np.sqrt(leaves.pixels) * depth * across / level.focal[0]
     return points, leaves.colors, sides
 
 
 def share_good(views: Sequence[SweptView], maps: Sequence[DepthMap]) -> float:
-    """The share of the views' pixels inside masks whose depths hold, in the mean of the views."""
+    """Return the fraction of used pixels with a good depth, averaged over the views."""
     shares = (each.good.sum() / max(each.level.used.sum(), 1) for each in maps)
     return float(sum(shares)) / len(views)
 
 
 def share_covered(views: Sequence[SweptView], points: Doubles) -> float:
-    """The share of the views' cells inside masks that points [P, 3] are in, in their mean."""
+    """Return the fraction of used cells that contain a point [P, 3], averaged over the views."""
     shares = []
     for view in views:
         height, width = view.coarse.used.shape
