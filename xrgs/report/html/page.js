@@ -1,6 +1,6 @@
 "use strict";
-// Shared helpers, the filters, and the links of the paper's figures. Text from the data is only ever
-// set as text: nothing here makes markup of it.
+// Shared helpers, the filters, and the links of the paper's figures. Text from the data is only set
+// as text, never as markup.
 const data = JSON.parse(document.getElementById("data").textContent);
 const SVG = "http://www.w3.org/2000/svg";
 const filters = { scene: "", label: "", metric: "" };
@@ -30,12 +30,12 @@ function fill(select, options, chosen) {
   if (chosen !== undefined) select.value = chosen;
 }
 
-// The name of a trained arm: on the page of one label there is no other.
+// The name of an arm; the page of a single label calls it `render`.
 function armName(label) {
   return data.alone ? "render" : label;
 }
 
-// HR, LR or test; where photographs are alike, training or test.
+// HR, LR or test; if photographs have one resolution, training or test.
 function kindName(kind) {
   return data.mixed || kind === "test" ? kind : "training";
 }
@@ -44,7 +44,7 @@ function labelled(text, select) {
   return element("label", {}, text, select);
 }
 
-// The names of a run: scene, then condition and replicate where there are several.
+// The name of a run: scene, condition, and replicate if there are several.
 function runName(run) {
   const replicate = several("replicate") ? `replicate ${run.replicate}` : "";
   return [run.scene, run.condition, replicate].filter(Boolean).join(", ");
