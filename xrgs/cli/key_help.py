@@ -1,4 +1,4 @@
-"""`xrgs-sweep help=KEY`: explains keys by the comments of `conf/config.yaml`."""
+"""`xrgs-sweep help=KEY`: explains a key by its comment in `conf/config.yaml`."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ class Entry(NamedTuple):
     """A key of `conf/config.yaml`."""
 
     value: str
-    """Its value in the baseline, as it is written there; empty for a group of keys."""
+    """The value in the baseline, as written; empty for a group of keys."""
     comment: tuple[str, ...]
-    """The lines of the comments above it and behind it."""
+    """The lines of the comments above and behind the key."""
 
 
 def explain(key: str) -> str:
-    """Return a key's value in the baseline and its comment; of a group also those of its keys.
+    """Return a key's value in the baseline and its comment; for a group, also those of its keys.
 
     Args:
-        key: A key as it stands before `=` on the command line, as `train.steps` or `train`.
+        key: A key or a group, as `train.steps` or `train`.
 
     Raises:
         XrgsError: There is no such key; the message offers similar ones.
@@ -47,10 +47,10 @@ def explain(key: str) -> str:
 
 
 def entries() -> dict[str, Entry]:
-    """Return what `conf/config.yaml` says of each key and each group of keys, in its order.
+    """Read the entries of `conf/config.yaml`, keys and groups of keys, in its order.
 
-    Of YAML only what the file uses is read: a key with its value on one line, and two more spaces
-    before each key of a group.
+    Only the YAML of this file is understood: a key with its value on one line, and two more spaces
+    of indent for the keys of a group.
     """
     known: dict[str, Entry] = {}
     path: list[str] = []

@@ -1,4 +1,4 @@
-"""The overrides for photographs as they are, which several commands take by their folder."""
+"""Makes overrides for a folder of photographs, or a video, that commands take by its path."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ if TYPE_CHECKING:
 
 
 def as_they_are(given: str) -> list[str]:
-    """Return the overrides for a folder of photographs, or for a video, of which none is degraded.
+    """Return the overrides for a folder of photographs, or a video, without any degradation.
 
-    What the photographs show tells how fine they are, and which are HR.
+    Views are tagged HR and LR by their measured sampling rates.
 
     Args:
         given: The folder, the folder with `/**`, or the video.
 
     Raises:
-        XrgsError: There is neither of that name.
+        XrgsError: There is no such folder or video.
     """
     path = user_path(given.removesuffix(ALL_BELOW))
     if path.suffix.lower() in SUFFIXES and not path.is_dir():
@@ -33,11 +33,11 @@ def as_they_are(given: str) -> list[str]:
     kind = "folder" if path.is_dir() else "video"
     if kind == "video" and path.suffix.lower() not in VIDEOS:
         raise XrgsError(f"{given}: is neither a folder of photographs nor a video")
-    # Nothing is cropped, and two photographs to train on are enough.
+    # `factor=1` crops nothing, and with `min_hr=1` two training photographs are enough.
     variant = ("variant=sampling_rate", "variant.factor=1", "variant.min_hr=1")
     return [f"scene={kind}", f"scene.path={given}", *variant]
 
 
 def last_of_each_key(words: Iterable[str]) -> list[str]:
-    """Return overrides without those whose key a later one has, which Hydra refuses for groups."""
+    """Keep only the last override of each key: Hydra refuses a group that is given twice."""
     return list({word.lstrip("+").partition("=")[0]: word for word in words}.values())

@@ -26,7 +26,7 @@ from xrgs.safeio.paths import user_path
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-#: The variable of the environment by which Hydra leaves errors to its caller.
+#: With this environment variable Hydra leaves errors to its caller.
 _FULL_ERROR = "HYDRA_FULL_ERROR"
 
 _HELP = """\
@@ -42,7 +42,7 @@ Commas make axes, +ablation=[a,b] stacks. Finished cells are found in the store 
   seed=0,1    store=FOLDER    data_root=FOLDER    threads=N    dry_run=true
   limits.minutes=N  limits.memory_gb=N    end cells that exceed a limit, and count them as failed
   retry=failed      fail_fast=true        train failed cells again; stop after the first failure
-  baseline=false                          train the ablations alone
+  baseline=false                          train only the ablations
 
 xrgs-sweep rerun=CELL [out=FOLDER] [store=FOLDER] [threads=N] [scene.path=FOLDER]
            [plugins=NAME[,NAME]...]
@@ -61,24 +61,24 @@ xrgs-sweep: say what to train:
 
 @dataclass
 class PhotographsConf:
-    """Where the photographs of a scene are now."""
+    """The present folder of a scene's photographs."""
 
     path: str | None = None
-    """Folder of the photographs; None for the one in the cell's config."""
+    """The folder; None for the one in the cell's config."""
 
 
 @dataclass
 class RerunConf:
-    """Arguments of `xrgs-sweep rerun=...`; any other value would make it another cell."""
+    """Arguments of `xrgs-sweep rerun=...`; no others are allowed, since they change the cell."""
 
     rerun: str = MISSING
-    """The cell: its folder, or its name in the store."""
+    """The cell: its folder, or a word for `Store.find_cell`."""
     out: str | None = None
     """Folder to write to; None for `<rerun>.rerun-1` or the next free number."""
     store: str | None = None
-    """Store that has the cell's variant; None for the one that the folder is in."""
+    """Store with the cell's variant; None for the store around the cell's folder."""
     threads: int | None = None
-    """Number of threads; None for as many as the cell was trained with."""
+    """Number of threads; None for the number in the cell's training."""
     scene: PhotographsConf = field(default_factory=PhotographsConf)
     plugins: str = ""
     """Names of components of other packages that the cell may import, separated by commas."""
@@ -86,7 +86,7 @@ class RerunConf:
 
 @hydra.main(version_base="1.3", config_path=str(config.CONF_DIR), config_name="config")
 def _run_job(cfg: DictConfig) -> str:
-    """Run one job; Hydra's launcher calls this, while Hydra's sweeper plans and launches."""
+    """Run one job. Hydra's launcher calls this; our sweeper has planned the job."""
     if "cell" not in cfg:
         raise CompactHydraException("hydra.mode must be MULTIRUN, as conf/config.yaml sets it")
     from xrgs.store.store import Store
@@ -97,10 +97,10 @@ def _run_job(cfg: DictConfig) -> str:
     brief = OmegaConf.select(hydra_conf, "sweeper.brief", default=False)
     session = SweepSession(Path(hydra_conf.sweep.dir), brief)
     outcome = run_job(session, Store(Path(cfg.store)), cfg.cell, cfg.name)
-    if session.owner_dead:  # a worker of joblib would wait for ever to hand over its answer
+    if session.owner_dead:  # else a worker of joblib would wait forever to hand over its answer
         os._exit(os.EX_TEMPFAIL)
     if outcome == INTERRUPTED and os.environ.get("SUBMITIT_EXECUTOR") == "slurm":
-        sys.exit(os.EX_TEMPFAIL)  # no answer yet: SLURM may be about to run this job again
+        sys.exit(os.EX_TEMPFAIL)  # not an answer: SLURM may run this job again
     return outcome
 
 
@@ -128,7 +128,7 @@ def main() -> None:
         sys.exit(2)
     with errors_as_messages("xrgs-sweep"):
         check_words(arguments)
-    # The plus that Hydra requires before these two is forgotten easily.
+    # Hydra requires a plus before these groups, which is easily forgotten.
     words = ["+" + w if w.partition("=")[0] in config.PLUS_GROUPS else w for w in arguments]
     run("xrgs-sweep", words, "Finished cells are kept: run the same command again to continue.")
 
@@ -139,10 +139,10 @@ def run(command: str, words: Sequence[str], hint: str) -> None:
     Args:
         command: Name of the command, which begins messages.
         words: The arguments of `xrgs-sweep`.
-        hint: What is said where a signal ends it: what is kept, and how to continue.
+        hint: The message if a signal ends the sweep: what is kept, and how to continue.
 
     Raises:
-        SystemExit: With code 1 where a cell failed; with a message where the user can correct the
+        SystemExit: With code 1 if a cell failed; with a message if the user can correct the
             problem.
     """
     with exit_on_signal(hint), _hydra_errors(command):
@@ -152,10 +152,10 @@ def run(command: str, words: Sequence[str], hint: str) -> None:
 
 @contextmanager
 def _hydra_errors(command: str) -> Iterator[None]:
-    """Say errors that the user can correct in one line, and show any other one with its traceback.
+    """Print errors that the user can correct in one line, and all others with their traceback.
 
-    Hydra would add to each that a variable of the environment shows a traceback. It leaves errors
-    to us where that variable is set; users who set it themselves see a traceback of every error.
+    Without `HYDRA_FULL_ERROR`, Hydra would handle errors itself and advise to set it. Users who
+    have set it see the traceback of every error.
     """
     if _FULL_ERROR in os.environ:
         yield
@@ -187,7 +187,7 @@ def _rerun(arguments: list[str]) -> None:
 
 
 def texts(words: Sequence[str]) -> DictConfig:
-    """Return `KEY=VALUE` words as a config of texts, which a merge into a schema converts."""
+    """Convert `KEY=VALUE` words to a config of texts; a merge into a schema converts the values."""
     conf = OmegaConf.create({})
     for word in words:
         key, _, value = word.partition("=")

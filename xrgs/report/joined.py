@@ -150,15 +150,15 @@ class ReportStore:
             commands[sweep_id] = record.command
             for row in record.cells:
                 key = (row.scene, row.condition, row.label, row.variant_seed, row.seed)
-                rows[key] = sweep_id, _merged(rows.get(key), sweep_id, row)
+                rows[key] = sweep_id, _fuller(rows.get(key), sweep_id, row)
         return commands, [row for _, row in rows.values()]
 
 
-def _merged(other: tuple[str, RecordedCell] | None, sweep_id: str, row: RecordedCell) -> RecordedCell:
+def _fuller(old: tuple[str, RecordedCell] | None, sweep_id: str, row: RecordedCell) -> RecordedCell:
     """Return the row with a cell id of two rows for one run; refuse two different cells."""
-    if other is None or other[1].cell_id is None:
+    if old is None or old[1].cell_id is None:
         return row
-    before, first = other
+    before, first = old
     if row.cell_id in {None, first.cell_id}:
         return first
     name = " / ".join(filter(None, (row.scene, row.label, row.condition)))

@@ -374,7 +374,7 @@ def _warnings(sweep: Sweep) -> list[str]:
     if len(arithmetics) > 1:
         warnings.append(
             f"The cells were trained with different arithmetic ({', '.join(arithmetics)}): that"
-            " alone makes cells differ as much as another seed does."
+            " makes cells differ as much as another seed does."
         )
     return warnings
 

@@ -140,7 +140,7 @@ function startCurves() {
     charts.push(chart("Gaussians", withMeans(seriesFrom(data.history, "step", "gaussians")), OVER.step, "Gaussians"));
     if (rule.value) charts.push(chart(RULES[rule.value], withMeans(seriesFrom(data.history, "step", rule.value)), OVER.step, "so far"));
     body.replaceChildren(...charts);
-    const used = data.alone && labels.length < 2 ? [] : labels.filter((label) => passes({ label, scene: filters.scene }));
+    const used = data.single && labels.length < 2 ? [] : labels.filter((label) => passes({ label, scene: filters.scene }));
     document.getElementById("curves-legend").replaceChildren(...legend(used));
   };
   over.addEventListener("change", draw);

@@ -53,7 +53,7 @@ class Content:
     """The cameras of the models."""
     notes: list[str] = field(default_factory=list)
     """Sentences on what was left out, and why."""
-    alone: bool = False
+    single: bool = False
     """Whether all cells have one label, so that there is nothing to compare."""
     mixed: bool = True
     """Whether photographs differ in resolution, so that the page names HR and LR."""

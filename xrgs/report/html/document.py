@@ -90,29 +90,29 @@ def write_document(
         add_trained(content, store, comparison, variants, _TRAINING_BYTES, _MODEL_BYTES)
     else:
         content.notes.append("Photographs, renders and models were left out: --pictures none.")
-    alone = not comparison.groups
+    single = not comparison.groups
     named = listed(comparison.scenes)
     head = {
         "id": shown(sweep.id),
-        "alone": alone,
-        "title": shown(named if alone else f"Change from {comparison.base}"),
+        "single": single,
+        "title": shown(named if single else f"Change from {comparison.base}"),
         "summary": summary(comparison),
         "commands": [shown(" ".join(("xrgs-sweep", *words))) for words in sweep.commands.values()],
         "base": shown(comparison.base),
         "answers": answers(comparison),
         "context": page_context(sweep, comparison, tables.contexts, variants),
-        "photographs": _photographs(sweep, alone=alone),
+        "photographs": _photographs(sweep, single=single),
         "warnings": [shown(text) for text in (*warnings, *tables.cautions)],
     }
-    content.alone = alone
+    content.single = single
     content.mixed = not all(report.alike for report in sweep.variants.values())
     write_text(file, _fitting(head, content, tables, [table for table in texts if table.rows]))
 
 
-def _photographs(sweep: Sweep, *, alone: bool) -> list[tuple[str, list[str]]]:
-    """Return (scene, notes on its photographs); `alone`, the first note is on their placement."""
+def _photographs(sweep: Sweep, *, single: bool) -> list[tuple[str, list[str]]]:
+    """Return (scene, notes on its photographs); if `single`, the placement is the first note."""
     by_scene = dict(photographs(sweep))
-    if alone:
+    if single:
         done = sweep.cells.loc[sweep.cells["state"] == "done", "scene"].unique()
         by_scene = {scene: (placement(sweep, scene), *by_scene.get(scene, ())) for scene in done}
     return [(shown(scene), [*map(for_line, notes)]) for scene, notes in by_scene.items()]

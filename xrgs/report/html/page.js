@@ -7,17 +7,17 @@ const filters = { scene: "", label: "", metric: "" };
 const onFilter = [];
 
 function element(name, attributes = {}, ...children) {
-  const made = document.createElement(name);
-  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
-  made.append(...children);
-  return made;
+  const node = document.createElement(name);
+  for (const [key, value] of Object.entries(attributes)) node.setAttribute(key, value);
+  node.append(...children);
+  return node;
 }
 
 function svg(name, attributes = {}, ...children) {
-  const made = document.createElementNS(SVG, name);
-  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
-  made.append(...children);
-  return made;
+  const node = document.createElementNS(SVG, name);
+  for (const [key, value] of Object.entries(attributes)) node.setAttribute(key, value);
+  node.append(...children);
+  return node;
 }
 
 function distinct(values) {
@@ -26,13 +26,13 @@ function distinct(values) {
 
 function fill(select, options, chosen) {
   select.replaceChildren(...options.map(([value, text]) => element("option", { value }, text)));
-  if (data.alone && select.parentElement?.tagName === "LABEL") select.parentElement.hidden = options.length < 2;
+  if (data.single && select.parentElement?.tagName === "LABEL") select.parentElement.hidden = options.length < 2;
   if (chosen !== undefined) select.value = chosen;
 }
 
 // The name of an arm; the page of a single label calls it `render`.
 function armName(label) {
-  return data.alone ? "render" : label;
+  return data.single ? "render" : label;
 }
 
 // HR, LR or test; if photographs have one resolution, training or test.
@@ -104,12 +104,12 @@ function startFigures(sections) {
 }
 
 document.addEventListener("DOMContentLoaded", () => {
-  if (!data.alone) startFilters();
+  if (!data.single) startFilters();
   startTables();
   const sections = { views: startViews(), training: startTraining() };
   startScores(sections.views);
   if (document.getElementById("curves")) startCurves();
-  if (!data.alone) startTradeOffs();
+  if (!data.single) startTradeOffs();
   startSplats();
   startFigures(sections);
 });

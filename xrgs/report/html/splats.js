@@ -270,7 +270,7 @@ class Splats {
     this.scene = element("select");
     this.look = element("select");
     // Two models side by side, or a single one.
-    const places = data.alone ? [0] : [0, 1];
+    const places = data.single ? [0] : [0, 1];
     this.sides = places.map(() => element("select"));
     this.frusta = element("input", { type: "checkbox", checked: "" });
     const nearer = element("button", { type: "button" }, "Nearer");
@@ -280,8 +280,8 @@ class Splats {
     this.captions = places.map(() => element("figcaption"));
     const canvases = places.map(() => element("canvas", { tabindex: "0", role: "img" }));
     const figures = canvases.map((canvas, place) => element("figure", {}, canvas, this.captions[place]));
-    const note = element("p", { class: "note" }, `Drag or press the arrow keys to turn ${data.alone ? "it, with Shift to shift it" : "both, with Shift to shift them"}; + and - or the wheel over a focused picture go nearer and farther. These are not the renders that are scored: only the Gaussians that show most in training views are kept, quantised to 8 and 16 bits, with their mean colour for all directions.`);
-    body.append(controls, element("div", { class: "legend" }, ...swatches), element("div", { class: data.alone ? "pair single" : "pair" }, ...figures), note);
+    const note = element("p", { class: "note" }, `Drag or press the arrow keys to turn ${data.single ? "it, with Shift to shift it" : "both, with Shift to shift them"}; + and - or the wheel over a focused picture go nearer and farther. These are not the renders that are scored: only the Gaussians that show most in training views are kept, quantised to 8 and 16 bits, with their mean colour for all directions.`);
+    body.append(controls, element("div", { class: "legend" }, ...swatches), element("div", { class: data.single ? "pair single" : "pair" }, ...figures), note);
     this.panels = canvases.map((canvas) => new Panel(canvas));
     fill(this.scene, this.keys.map((key) => [key, key]));
     this.scene.addEventListener("change", () => this.choose());
@@ -324,7 +324,7 @@ class Splats {
       const model = this.models[Number(this.sides[side].value)];
       panel.load(model, this.cameras);
       const kept = `${model.count.toLocaleString("en")} of ${model.total.toLocaleString("en")} Gaussians, ${(100 * model.share).toFixed(1)} % of the blending weight`;
-      this.captions[side].replaceChildren(...(data.alone ? [] : [element("b", {}, model.label), " "]), kept);
+      this.captions[side].replaceChildren(...(data.single ? [] : [element("b", {}, model.label), " "]), kept);
       panel.canvas.setAttribute("aria-label", `3D view of ${model.label}: ${this.scene.value}. ${kept}. Arrow keys turn it.`);
     });
     if (this.camera) this.draw();

@@ -168,7 +168,7 @@ function testPictures(entry) {
   return [
     { name: "photograph", caption: `${entry.size[0]} × ${entry.size[1]} px${hidden}`, image: entry.photograph, alt: `Photograph: ${at}` },
     ...arms.map((arm) => ({ name: armName(arm.label), label: arm.label, caption: scoresText(arm.scores), image: arm.image, alt: `Render by ${arm.label}: ${at}. ${scoresText(arm.scores)}` })),
-    ...arms.map((arm) => ({ name: data.alone ? "error" : `error of ${arm.label}`, caption: "", image: arm.error, apart: true, alt: `Error map of ${arm.label}: ${at}` })),
+    ...arms.map((arm) => ({ name: data.single ? "error" : `error of ${arm.label}`, caption: "", image: arm.error, apart: true, alt: `Error map of ${arm.label}: ${at}` })),
   ];
 }
 
@@ -177,7 +177,7 @@ function trainingPictures(entry) {
   const size = `${entry.size[0]} × ${entry.size[1]} px`;
   const found = [{ name: data.mixed ? `${entry.tag} photograph` : "photograph", caption: `as trained on, ${size}`, image: entry.photograph, coarse: data.mixed && entry.tag === "LR", alt: `${kindName(entry.tag)} photograph, ${size}: ${at}` }];
   if (entry.original !== null) found.push({ name: "original", caption: "before it was degraded; only all_hr trains on it", image: entry.original, alt: `The photograph before it was degraded: ${at}` });
-  return [...found, ...entry.arms.map((arm) => ({ name: armName(arm.label), label: arm.label, caption: data.alone ? "" : "render", image: arm.image, alt: `Render by ${arm.label}: ${at}` }))];
+  return [...found, ...entry.arms.map((arm) => ({ name: armName(arm.label), label: arm.label, caption: data.single ? "" : "render", image: arm.image, alt: `Render by ${arm.label}: ${at}` }))];
 }
 
 function startViewer(id, entries, pictures, name, missing) {
@@ -203,8 +203,8 @@ function startTraining() {
 function startScores(viewer) {
   const table = document.getElementById("scores-table");
   if (!table) return;
-  const ofRun = !data.alone || distinct(data.views.map(runName)).length > 1;
-  const names = [...(ofRun ? ["Scene"] : []), "View", ...(data.alone ? [] : ["Arm"])];
+  const ofRun = !data.single || distinct(data.views.map(runName)).length > 1;
+  const names = [...(ofRun ? ["Scene"] : []), "View", ...(data.single ? [] : ["Arm"])];
   const head = element("tr", {}, ...names.map((text) => element("th", {}, text)), ...data.scores.map((score) => element("th", { class: "number" }, score.label)));
   table.tHead.append(head);
   const rows = data.views.flatMap((entry, place) => entry.arms.map((arm) => ({ entry, place, arm })));
@@ -221,13 +221,13 @@ function startScores(viewer) {
       const text = value === null ? "n/a" : value.toFixed(score.name.startsWith("psnr") ? 2 : 4);
       return element("td", { class: "number", "data-value": value ?? "" }, text);
     });
-    const row = element("tr", {}, ...(ofRun ? [element("td", {}, runName(entry))] : []), element("td", {}, name), ...(data.alone ? [] : [element("td", {}, arm.label)]), ...numbers);
+    const row = element("tr", {}, ...(ofRun ? [element("td", {}, runName(entry))] : []), element("td", {}, name), ...(data.single ? [] : [element("td", {}, arm.label)]), ...numbers);
     Object.assign(row.dataset, { scene: entry.scene, label: arm.label });
     table.tBodies[0].append(row);
   }
   makeSortable(table);
   // The page of a single label sorts by PSNR, as the views above.
-  const by = data.alone ? Math.max(0, data.scores.findIndex((score) => score.name === "psnr")) : 0;
+  const by = data.single ? Math.max(0, data.scores.findIndex((score) => score.name === "psnr")) : 0;
   sortBy(table, names.length + by, !data.scores[by].higher);
   onFilter.push(() => {
     for (const row of table.tBodies[0].rows) row.hidden = !passes(row.dataset);
