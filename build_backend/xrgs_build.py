@@ -158,9 +158,9 @@ def _compiles(command: str) -> bool:
 
 def _required_compiler() -> list[str]:
     """Return the requirement of a compiler from PyPI, if the machine has none."""
-    served = platform.system() == _ZIGLANG_SYSTEM and platform.machine() in _ZIGLANG_MACHINES
+    supported = platform.system() == _ZIGLANG_SYSTEM and platform.machine() in _ZIGLANG_MACHINES
     named = os.environ.get("CXX", "").strip()
-    return [ZIGLANG] if served and not named and find_compiler() is None else []
+    return [ZIGLANG] if supported and not named and find_compiler() is None else []
 
 
 @contextlib.contextmanager
