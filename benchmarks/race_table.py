@@ -188,7 +188,7 @@ def _change(longest: Mapping[tuple[str, str], Run], arm: str, base: str, score: 
 
 
 def notes(runs: Sequence[Run]) -> list[str]:
-    """Return Markdown lines on what the numbers depend on: machine, programs, averages."""
+    """Return Markdown lines on machine, programs and averages, for the reader of the tables."""
     programs = ", ".join(dict.fromkeys(run.program for run in runs))
     lines = [
         f"- {runs[0].machine}; {programs}.",

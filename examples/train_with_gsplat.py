@@ -28,7 +28,7 @@ from torch.nn import functional
 
 
 class View(NamedTuple):
-    """A view in the folder of `save`."""
+    """A view in the folder that `save` writes."""
 
     name: str
     viewmat: Tensor  # [4, 4] world to camera

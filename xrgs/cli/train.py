@@ -46,7 +46,7 @@ _QUALITIES = {
     "high": ("preset=paper", "train.evaluate_every=0"),
 }
 #: Runs of at least _LONG_RUN steps have the settings of `preset=paper`. Shorter runs refine every
-#: _REFINED_EVERY steps, as `preset=laptop` does: more often, more Gaussians grow than are trained.
+#: _REFINED_EVERY steps, as `preset=laptop` does; more refinements grow more than they can train.
 _LONG_RUN, _REFINED_EVERY = 10_000, 50
 
 
@@ -112,8 +112,8 @@ class _Words:
 def train(settings: Settings) -> None:
     """Make a 3D scene of photographs: find the cameras, train, and write a page with the result.
 
-    Run again, it finds what is done. Then xrgs-view shows the scene, xrgs-render makes a film of
-    it, and xrgs-data export writes it for other programs.
+    The same command continues after an interruption. Afterwards xrgs-view shows the scene,
+    xrgs-render makes a film of it, and xrgs-data export writes it for other programs.
 
     Args:
         settings: The options.
@@ -200,7 +200,7 @@ def _place(words: _Words) -> _Placed | None:
     for note in notes:
         _say(f"  {note}")
     if planned.id is None:
-        _say("without --dry-run, their cameras are found, and a recipe is chosen for what they are")
+        _say("without --dry-run, their cameras are found, and a recipe is chosen for them")
         return None
     report = ReportStore(store).variant_report(planned.id)
     mix = mixture(read_views(store.variants, planned.id))

@@ -1,4 +1,4 @@
-"""Reads from EXIF and XMP which camera took a photograph, and what was done to its picture since.
+"""Reads from EXIF and XMP which camera took a photograph, and whether it was zoomed or cropped.
 
 Nothing here is sure: programs that crop, zoom or stitch may keep all tags as they were.
 """
@@ -67,7 +67,7 @@ def read(path: Path) -> Taken:
 
 
 def _number(value: object) -> float | None:
-    """Convert a value of EXIF to a number; None if it is none, such as a fraction n / 0."""
+    """Convert a value of EXIF to a number; None if that fails, as for a fraction n / 0."""
     with suppress(Exception):
         return float(value)  # type: ignore[arg-type]
     return None

@@ -1,4 +1,4 @@
-"""Names the files of other programs that are given as poses, and says what to do with them."""
+"""Recognises files of other programs that users give as poses, for messages with advice."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _KEYS = {
 
 
 def kind(file: Path) -> str:
-    """Say what a file is, by the end of its name; empty if that tells nothing."""
+    """Describe a file by the end of its name, such as `an archive`; empty if the end is unknown."""
     return next((w for end, (w, _) in _ENDINGS.items() if file.name.lower().endswith(end)), "")
 
 

@@ -86,7 +86,7 @@ MAX_PNG_PIXELS = 1 << 26
 _MAX_EXPANSION, _SMALL_PIXELS = 1032, 1 << 24
 #: PIL's mode -> the fewest bits of a pixel before compression; 24 for other modes.
 _BITS = {"1": 1, "P": 1, "L": 8}
-#: With `scene.alpha=mask`, pixels of a lower alpha are outside. Our choice.
+#: With `scene.alpha=mask`, pixels with a lower alpha are masked out. Our choice.
 OPAQUE_FROM = 0.5
 _EXIF_ORIENTATION = 0x0112
 _EXIF_DETAILS, _EXIF_COLOUR_SPACE, _EXIF_INTEROPERABILITY = 0x8769, 0xA001, 0xA005
@@ -343,7 +343,7 @@ class _PilFile:
             (number,) = struct.unpack_from(">I", self._box, 3)
             if number not in _JP2_COLOURS:
                 raise colour.ColourError(f"colours of kind {number} of JPEG 2000 are not read")
-        with suppress(Exception):  # as for EXIF itself
+        with suppress(Exception):  # PIL raises nearly anything on damaged EXIF
             interoperability = self.exif.get_ifd(_EXIF_INTEROPERABILITY).get(1, "")
             space = self.exif.get_ifd(_EXIF_DETAILS).get(_EXIF_COLOUR_SPACE)
             if interoperability.startswith("R03") or space == 2:

@@ -171,7 +171,7 @@ class Masks:
             if not fits_seen:
                 stored.add(name)
             elif mask.orientation > 1 or not _same_shape(mask.size, as_stored):
-                seen.add(name)  # a mask with a tag of its own has been turned by it
+                seen.add(name)  # the mask's own EXIF orientation turns it
             else:
                 either.add(name)
         notes = []

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from typing import BinaryIO
 
 _WHITE = 65535
-#: If no 16-bit value is larger, the file uses 14 bits or fewer, as many as a camera's sensor gives.
+#: If no 16-bit value is larger, the file uses 14 bits or fewer, like cameras' sensors.
 _LARGEST_OF_14_BITS = (1 << 14) - 1
 _MAX_SAMPLE_VALUE = 281
 #: TIFF's photometric interpretations that are read (white is zero, black is zero, RGB, CMYK) and

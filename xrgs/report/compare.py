@@ -87,7 +87,7 @@ class Design:
     """The largest change of LPIPS that counts as none, %; our choice."""
 
     def margin(self, metric: Metric) -> float:
-        """Return the margin of a metric, in the scale of its effect; 0 where it has none."""
+        """Return the margin of a metric in the unit of its effect; 0 if it has none."""
         if metric.unit == "dB":
             return self.margin_psnr
         is_lpips = metric.name in {"lpips", "lpips_vgg"}
@@ -117,7 +117,7 @@ class Comparison:
     scenes: tuple[str, ...]
     """Names of the scenes, sorted."""
     groups: tuple[tuple[str, str], ...]
-    """(label, condition) of each label but the base, in the sweep's order."""
+    """(label, condition) of all labels except the base, in the sweep's order."""
     cells: pd.DataFrame
     """`Sweep.cells` with two more columns: `base_id`, the cell that each is compared with, and
     `elsewhere`, the reason if their times can't be compared (another machine or number of threads),

@@ -40,7 +40,7 @@ class Context:
     training: tuple[str, ...] = ()
     """Steps, size, factor, test views and the rule against large Gaussians, as phrases."""
     machine: tuple[str, ...] = ()
-    """Processor, threads and backend, as phrases: what times depend on."""
+    """Processor, threads and backend, on which times depend, as phrases."""
     cautions: tuple[str, ...] = ()
     """Sentences on scores that are easily misread."""
 

@@ -46,7 +46,7 @@ _Measured = Annotated[float, Meta(gt=0, le=1e30)] | None
 
 
 class Figures(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """`figures.json` beside the renders of a scene: what the other program's training took."""
+    """`figures.json` beside the renders of a scene: time and size of that program's training."""
 
     training_time_s: _Measured = None
     """Seconds of training, on the machine that trained the sweep's cells."""

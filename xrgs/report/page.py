@@ -388,9 +388,9 @@ def _stale_warning(sweep: Sweep) -> list[str]:
     always = [m for m in METRICS if m.score and not m.optional]
     scores = [m.label for m in always if names & {m.name, PROTOCOL}]
     return [
-        f"The scores of {counted(len(stale), 'cell')} are missing or of other code than is"
-        f" installed ({', '.join(scores)}): xrgs-store rescore computes them. A score is compared"
-        " between cells that the same code has scored."
+        f"Scores of {counted(len(stale), 'cell')} are missing, or other code than the installed has"
+        f" computed them ({', '.join(scores)}): xrgs-store rescore computes them. A score is"
+        " compared between cells that the same code has scored."
     ]
 
 

@@ -176,7 +176,7 @@ def _beside(
     scene: str,
     context: str,
 ) -> TextTable:
-    """Return a column of the paper beside the changes of a scene, or for "" of the scenes' mean."""
+    """Compare a column of the paper with a scene's changes, or their mean if `scene` is empty."""
     scenes = 1 if scene else len(comparison.scenes)
     rows = [
         _row(label, metric, column.changes[metric.name], row, scenes)

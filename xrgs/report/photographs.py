@@ -32,7 +32,7 @@ def with_variants(sweep: Sweep, store: ReportStore) -> Sweep:
             reports[variant_id] = store.variant_report(variant_id)
         except StoreError as error:
             why = store.without_paths(str(error))
-            reports[variant_id] = SfmReport(notes=(f"not known, what became of them: {why}",))
+            reports[variant_id] = SfmReport(notes=(f"unknown what was done with them: {why}",))
     return replace(sweep, variants=reports)
 
 
@@ -56,7 +56,7 @@ def placement(sweep: Sweep, scene: str) -> str:
     rows = sweep.cells[(sweep.cells["scene"] == scene)]
     reports = [sweep.variants[name] for name in rows["variant_id"] if name in sweep.variants]
     if not reports or not reports[0].images:
-        return "not known, how the photographs were placed"
+        return "it is unknown how the photographs were placed"
     report = reports[0]
     by = "structure from motion" if report.poses is None else "the cameras that were given"
     error = report.reprojection_error_px

@@ -1,7 +1,7 @@
 """Renders models along a path of cameras, side by side, into an MP4 film or PNG frames.
 
-The renderer and its settings are those of evaluation: a frame at a test camera, if it has the
-intrinsics of the first test view, equals the scored render.
+Evaluation has the same renderer and settings: a frame at a test camera, if it has the intrinsics of
+the first test view, equals the scored render.
 """
 
 from __future__ import annotations

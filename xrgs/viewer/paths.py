@@ -63,7 +63,7 @@ def orbit(poses: Poses, views: int) -> Array:
     photographed from elsewhere.
 
     Args:
-        poses: What the path is fitted to.
+        poses: The cameras and points of the scene.
         views: Number of cameras, at least 1.
 
     Returns:
@@ -95,7 +95,7 @@ def spiral(poses: Poses, views: int) -> Array:
     farthest depth of the points, with weights 1/4 and 3/4.
 
     Args:
-        poses: What the path is fitted to.
+        poses: The cameras and points of the scene.
         views: Number of cameras, at least 1.
 
     Returns:
@@ -131,7 +131,7 @@ def through_test_views(poses: Poses, views: int) -> Array:
     at constant angular velocity. The first camera is the first test view, the last one the last.
 
     Args:
-        poses: What the path is fitted to.
+        poses: The cameras and points of the scene.
         views: Number of cameras, at least 1.
 
     Returns:
@@ -147,7 +147,7 @@ def through_training_views(poses: Poses, views: int) -> Array:
     it would shake. In between it is interpolated as in `through_test_views`.
 
     Args:
-        poses: What the path is fitted to.
+        poses: The cameras and points of the scene.
         views: Number of cameras, at least 1.
 
     Returns:
@@ -178,7 +178,7 @@ def default_path(poses: Poses) -> str:
     and an orbit inwards.
 
     Args:
-        poses: What the path is fitted to.
+        poses: The cameras and points of the scene.
     """
     path = orbit(poses, _PROBES)
     places, focus = camera_positions(path), look_at_point(poses)

@@ -57,7 +57,7 @@ class TrainingView:
     original: Image | None
     """The photograph before it was degraded; None if it was not."""
     rendered: tuple[int, int]
-    """Width and height of the renders, px: those of the original, else of the photograph."""
+    """Width and height of the renders, px: the original's size, else the photograph's."""
     renders: dict[str, Image]
     """Id of a cell -> its render."""
 

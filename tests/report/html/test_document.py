@@ -78,7 +78,7 @@ def test_the_page_of_one_cell_shows_the_scene_and_no_furniture_of_a_comparison(a
         "arms",
     ):
         assert furniture not in words
-    assert "not known, how the photographs were placed" in words
+    assert "it is unknown how the photographs were placed" in words
     terms, texts = ([text for text in parsed.texts[of] if text.strip()] for of in ("dt", "dd"))
     values = dict(zip(terms, texts, strict=True))
     assert values == {

@@ -202,7 +202,7 @@ class _Download:
                     if self._size - before < _LEAST_BYTES:
                         raise _LostError(f"fewer than {_LEAST_BYTES} bytes in {_PERIOD_S:g} s")
                     since, before = monotonic(), self._size
-        # http.client takes cut-off headers for whole ones: then no byte follows.
+        # http.client accepts headers that are cut off; then no bytes follow.
         if self._size == 0 or total not in (None, self._size):
             of = "" if total is None else f" of {total}"
             raise _LostError(f"the connection ended after {self._size}{of} bytes")

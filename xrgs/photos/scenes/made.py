@@ -1,4 +1,4 @@
-"""Leaves out images that programs made of the photographs beside them, as masks and depth maps."""
+"""Leaves out images that programs made from photographs, such as masks and depth maps."""
 
 from __future__ import annotations
 

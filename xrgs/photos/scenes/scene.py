@@ -1,4 +1,4 @@
-"""What all kinds of scenes share: the dataclass, the protocol of a kind, and checks."""
+"""The common parts of all kinds of scenes: the dataclass, the protocol of a kind, and checks."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Scene:
     name: str
     """The name of the scene in tables."""
     fingerprint: str
-    """A hash of the photographs' names and bytes, or of what they are rendered from."""
+    """A hash of the photographs' names and bytes, or of the code and values that render them."""
     files: Mapping[str, Path]
     """The photographs, sorted by name."""
     intrinsics: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)

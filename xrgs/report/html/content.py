@@ -40,11 +40,11 @@ class Content:
     views: list[dict[str, Any]] = field(default_factory=list)
     """Test views with their scores, and images unless they were left out."""
     training: list[dict[str, Any]] = field(default_factory=list)
-    """Training views beside renders of them."""
+    """Training views with their renders."""
     curves: list[dict[str, Any]] = field(default_factory=list)
     """Quality during training of each cell."""
     history: list[dict[str, Any]] = field(default_factory=list)
-    """Gaussians during training of each cell, and what each rule grew and pruned."""
+    """Counts of each cell over its steps: Gaussians, and those grown and pruned by each rule."""
     trade_offs: list[dict[str, Any]] = field(default_factory=list)
     """Gaussians and scores of each label and scene."""
     models: list[dict[str, Any]] = field(default_factory=list)
@@ -133,7 +133,7 @@ def add_curves(content: Content, quality: pd.DataFrame) -> None:
 
 
 def add_history(content: Content, store: ReportStore, comparison: Comparison) -> None:
-    """Add Gaussians over steps, and what each rule grew and pruned, of each finished cell."""
+    """Add the counts over steps (`RULES`) of each finished cell."""
     for rows in runs(comparison):
         for _, row in rows[~rows["cell_id"].isin(store.external)].iterrows():
             try:
