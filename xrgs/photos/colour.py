@@ -289,7 +289,7 @@ def _linear(rgb: NDArray[np.float32], encoding: Encoding) -> NDArray[np.float32]
     linear: NDArray[np.float32]
     if encoding.smpte == _H273_SMPTE_240M:
         linear = np.where(rgb < 4 * 0.0228, rgb / 4, ((rgb + 0.1115) / 1.1115) ** (1 / 0.45))
-    elif encoding.smpte == _H273_SMPTE_428:  # of cinemas, whose white is 48 of 52.37 cd/m²
+    elif encoding.smpte == _H273_SMPTE_428:  # of cinemas: white has 48 cd/m², the most is 52.37
         linear = np.minimum(52.37 / 48 * rgb**2.6, 1)
     elif encoding.gamma is None:
         linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 _MAKE, _MODEL = 0x010F, 0x0110
 _FOCAL, _FOCAL_35MM = 0x920A, 0xA405  # mm; the second is the 35 mm equivalent
 _DIGITAL_ZOOM, _CUSTOM_RENDERED = 0xA404, 0xA401
-_WIDTH, _HEIGHT = 0xA002, 0xA003  # of the picture as the camera saved it, px
+_WIDTH, _HEIGHT = 0xA002, 0xA003  # size of the picture as saved by the camera, px
 #: The value of CustomRendered by which Apple's cameras mark a panorama.
 _APPLE_PANORAMA = 6
 #: The largest relative deviation of a picture's aspect ratio from EXIF's, for rounded sides.
@@ -76,7 +76,7 @@ def _number(value: object) -> float | None:
 def _cut(details: dict[int, Any], xmp: str, size: tuple[int, int]) -> str:
     """Return `Taken.cut` of a photograph of this size, px."""
     parts = []
-    zoom = _number(details.get(_DIGITAL_ZOOM)) or 1.0  # 0 says that there was none
+    zoom = _number(details.get(_DIGITAL_ZOOM)) or 1.0  # 0 means no zoom
     if zoom > 1:
         parts.append(f"zoomed {zoom:.2f}")
     if _HAS_CROP.search(xmp) and (sides := sorted(_CROP.findall(xmp))):

@@ -98,7 +98,7 @@ class ImageError(XrgsError):
 
 
 class _RefusedError(ValueError):
-    """A sound file that is not read; the message says why."""
+    """An intact file that can't be used; the message says why."""
 
 
 # PIL's limit holds for the whole process, and refuses photographs that `MAX_PIXELS` admits.
@@ -186,7 +186,7 @@ def _formats(start: bytes, suffix: str) -> tuple[str, ...]:
 
 
 def is_photograph(path: Path) -> bool | None:
-    """Tell from the first bytes of a file without an image's suffix whether it is a photograph.
+    """Return whether a file without an image's suffix is a photograph, by its first bytes.
 
     Returns:
         None where it may be an image of a format that is not read.
@@ -540,7 +540,7 @@ def _small(image: Image.Image, side: int) -> NDArray[np.uint8]:
 
 
 def metadata(path: Path) -> tuple[Image.Exif, dict[int, Any], str]:
-    """Read a photograph's EXIF, EXIF's sub-IFD of how it was taken, and XMP; empty if absent.
+    """Read a photograph's EXIF, its sub-directory on the exposure, and XMP; empty if absent.
 
     Raises:
         UnreadableError: The file can't be read now.
@@ -554,7 +554,7 @@ def metadata(path: Path) -> tuple[Image.Exif, dict[int, Any], str]:
 
 
 def decode(path: Path) -> Picture:
-    """Decode a photograph: upright, in sRGB 0..1 (8-bit values / 255), with alpha apart.
+    """Decode a photograph: upright, in sRGB 0..1 (8-bit values / 255), with separate alpha.
 
     Raises:
         UnreadableError: The file can't be read now.

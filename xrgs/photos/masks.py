@@ -116,7 +116,7 @@ def _images_below(root: Path) -> list[Path]:
 
 
 def _keys(inside: Path) -> Iterator[str]:
-    """Yield the keys (see `_key`) of the photographs whose mask a file may be, by its name."""
+    """Yield the keys (see `_key`) of photographs whose mask may have this path."""
     for stem in dict.fromkeys((inside.stem, _AFFIX.sub("", inside.stem))):
         yield _key("_".join([*inside.parent.parts, stem]))
         if Path(stem).suffix.lower() in images.SUFFIXES:

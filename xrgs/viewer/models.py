@@ -37,7 +37,7 @@ class PosedView:
 
     name: str
     kind: str
-    """`HR` or `LR` of a training view, `test` of one that is scored."""
+    """`HR` or `LR` for a training view, `test` for a scored view."""
     camera: Camera
 
 

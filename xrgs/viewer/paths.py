@@ -118,7 +118,7 @@ def spiral(poses: Poses, views: int) -> Array:
     depth = 1 / (_NEAR_WEIGHT / (_NEAR_FACTOR * near) + (1 - _NEAR_WEIGHT) / (_FAR_FACTOR * far))
     target = centre + depth * rotation[2]
     angles = 2 * np.pi * _TURNS * np.arange(views) / views
-    # The minus signs of LLFF are of its axes up and backward; these are down and forward.
+    # LLFF has minus signs here: its axes point up and backward, ours down and forward.
     turns = np.stack([np.cos(angles), np.sin(angles), np.sin(_AXIAL_RATE * angles)], axis=1)
     places = centre + (turns * radii) @ rotation
     return np.stack([_look_at(place, target - place, up) for place in places])
@@ -170,12 +170,12 @@ def _through(viewmats: Array, views: int) -> Array:
 
 
 def default_path(poses: Poses) -> str:
-    """Return `orbit`, or `training` where an orbit would leave the space that the cameras see.
+    """Return `orbit`, or `training` if an orbit would leave the space that the cameras see.
 
-    It stays there if each of its cameras has a training camera that is nearer than the point that
-    they look at, and looks the same way to 60 degrees. Around an object, and in the arc before a
-    forward-facing scene, that holds. In a scene that is seen from inside, the cameras look outwards
-    and an orbit inwards.
+    An orbit stays in that space if each of its cameras has a training camera that is nearer to it
+    than the focus is, and looks the same way to 60 degrees. That holds around an object, and on the
+    arc in front of a forward-facing scene. In a scene seen from inside, the training cameras look
+    outwards and an orbit looks inwards.
 
     Args:
         poses: The cameras and points of the scene.

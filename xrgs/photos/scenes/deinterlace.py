@@ -17,11 +17,10 @@ if TYPE_CHECKING:
     from av.filter.graph import Graph
     from av.video.frame import VideoFrame
 
-#: `idet` leaves its first frames undecided, so that this many frames pass it once before.
+#: `idet` leaves its first frames undecided, so this many frames are fed to it twice.
 _WARM_UP = 12
 #: `idet` marks a frame if one field differs this many times more from the frame before it than the
-#: other field does.
-#: FFmpeg's own 1.04 marks frames of a camera that moves slowly; our choice.
+#: other field does. FFmpeg's own 1.04 marks frames of a camera that moves slowly; our choice.
 _LEAST_RATIO = 1.2
 _TIME_BASE = Fraction(1, 25)
 

@@ -83,7 +83,7 @@ def _made_of_others(files: Sequence[Path]) -> set[Path]:
     extended: dict[tuple[Path, str], list[tuple[Path, Path]]] = defaultdict(list)
     for stem, group in named.items():
         plain = {_ADDED_BEFORE.sub("", stem), _ADDED_AFTER.sub("", stem)} - {stem}
-        of_whole_name = stem in names and names[stem] not in group  # or it has no suffix
+        of_whole_name = stem in names and names[stem] not in group  # not itself, without suffix
         if of_whole_name or plain & known.keys():
             made |= {*group}
             continue

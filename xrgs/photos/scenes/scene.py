@@ -35,7 +35,7 @@ _SETTLED_NS = 2 * 10**9
 
 @dataclass(frozen=True)
 class Scene:
-    """The photographs of a scene, and the cameras where they are known.
+    """The photographs of a scene, and the cameras if they are known.
 
     The key of all mappings is the name of a photograph, which is also the name of its view.
     """
@@ -53,7 +53,7 @@ class Scene:
     """Exact world-to-camera matrices [4, 4]. SfM never gets them: its poses are compared with
     them."""
     masks: Mapping[str, Path] = field(default_factory=dict)
-    """The mask of each photograph that has one; white is used."""
+    """The mask of each photograph that has one; white pixels are used."""
     alpha: str = "composite"
     """`composite` lays transparent pixels over `background`; `mask` leaves them out."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)

@@ -231,7 +231,7 @@ def _brightness(frame: VideoFrame) -> NDArray[np.uint8]:
 
 
 def _shown(frame: _Frame) -> images.ImageArray:
-    """Return a frame [H, W, 3] in 0..1: in sRGB, with square pixels, and turned."""
+    """Return a frame [H, W, 3] in 0..1: in sRGB, with square pixels, upright."""
     decoded = frame.decoded
     is_hd = decoded.colorspace == _UNKNOWN_MATRIX and decoded.height >= _HD_ROWS
     pixels = decoded.reformat(
