@@ -148,7 +148,7 @@ class Race:
         """
         if start.arm == PEERS[0]:
             if not any(run.minutes == max(budgets) for run in self._of(start)):
-                self._add(start, self._as_it_is(start, budgets))
+                self._add(start, self._with_defaults(start, budgets))
             return
         run = self._planned if start.arm in PEERS else self._ours
         while steps := plan(self._of(start), minutes, self.probe_steps):
@@ -197,7 +197,7 @@ class Race:
             **{name: metrics.get(name, math.nan) for name in race_table.SCORES},
         }
 
-    def _as_it_is(self, start: Start, budgets: Sequence[float]) -> Iterator[dict[str, Any]]:
+    def _with_defaults(self, start: Start, budgets: Sequence[float]) -> Iterator[dict[str, Any]]:
         """Run OpenSplat once with its defaults; yield a row for the last .ply in each budget."""
         options = ("-n", str(NOMINAL_STEPS))
         yield from self._peer(start, options, _PEER_EVERY, {60 * m: m for m in budgets})

@@ -111,7 +111,7 @@ def initial_splats(points: Tensor, colors: Tensor, device: str) -> torch.nn.Para
 
 
 def ssim(first: Tensor, second: Tensor) -> Tensor:
-    """Mean SSIM of two images [H, W, 3] over the windows that lie inside [wang2004]."""
+    """Return the mean SSIM of two images [H, W, 3] over the windows that lie inside [wang2004]."""
     offsets = torch.arange(11, device=first.device) - 5.0
     taps = torch.exp(-offsets.square() / (2 * 1.5**2))
     taps = (taps / taps.sum()).expand(15, 1, 11)

@@ -217,7 +217,7 @@ def as_ply(read: Arrays, suffix: str) -> Arrays:
     turned["positions"] = read["positions"] * [-1, -1, 1]
     if "shapes" in read:
         turned["shapes"] = read["shapes"] * [1, 1, -1, 1, -1, 1]
-    if "harmonics" in read:  # those of odd m change their sign
+    if "harmonics" in read:  # harmonics of odd order m change sign
         odd = [abs(m) % 2 for band in (1, 2, 3) for m in range(-band, band + 1)]
         turned["harmonics"] = read["harmonics"] * (1 - 2 * np.array(odd))[:, None]
     return turned

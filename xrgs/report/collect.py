@@ -225,7 +225,7 @@ def _totals(history: Mapping[str, list[float]]) -> dict[str, float]:
 
 
 def is_component_log(column: str) -> bool:
-    """Return whether a component logged a column: its name is before a dot."""
+    """Return whether a component logged a column, which is then named `<component>.<value>`."""
     return "." in column
 
 

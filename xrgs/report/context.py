@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 #: Scores of fewer views than this say little: one more view may reverse their order.
 _ENOUGH_VIEWS = 3
-#: The longest shown value of a config or name of a processor, and the longest sentence, characters.
+#: The longest shown value (of a config, or a processor's name) and sentence, in characters.
 _MAX_SHOWN = 120
 _MAX_SENTENCE = 240
 _ALL_HR = "all views HR"

@@ -71,8 +71,8 @@ class Panel(NamedTuple):
 def _default_style() -> Iterator[None]:
     """Use matplotlib's default style, without mathematics between dollar signs.
 
-    No warning says that the font lacks characters or shapes of a script: the report's tables have
-    the full names.
+    Warnings about characters that the font lacks or can't shape are hidden: the report's tables
+    have the names.
     """
     with style.context(["default", {"text.parse_math": False}]), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing from")

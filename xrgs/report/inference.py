@@ -20,7 +20,7 @@ CONFIDENCE = 0.95
 #: The fewest values behind a mean with a verdict or a test; our choice. Two values show too little
 #: of their scatter: Student's interval for them is 13 times as wide as their distance.
 MIN_VALUES = 3
-#: A change is shown, and an equivalence too, if the (corrected) p is at most this.
+#: The largest (corrected) p at which a change, or an equivalence, counts as shown.
 LEVEL = 0.05
 NOT_MEASURED = "not measured"
 OTHER_MACHINE = "timed on another machine"
@@ -156,7 +156,7 @@ def prediction_half_width(spread: Floats, n: Floats) -> Floats:
 
 
 def p_values(mean: Floats, spread: Floats, n: Floats) -> Floats:
-    """Return the p of Student's two-sided test, of each mean, that the true mean is 0.
+    """Return the p of Student's two-sided test of each mean; null hypothesis: the true mean is 0.
 
     It is below 0.05 if and only if the 95 % interval does not contain 0.
 
@@ -174,7 +174,7 @@ def p_values(mean: Floats, spread: Floats, n: Floats) -> Floats:
 
 
 def sign_test(up: Floats, down: Floats) -> Floats:
-    """Return the p of the exact two-sided sign test, that both signs are equally likely.
+    """Return the p of the exact two-sided sign test; null hypothesis: the signs are equally likely.
 
     Args:
         up: [N] numbers of values above 0.
@@ -188,7 +188,7 @@ def sign_test(up: Floats, down: Floats) -> Floats:
 
 
 def equivalence(mean: Floats, spread: Floats, n: Floats, margin: Floats) -> Floats:
-    """Return the p of two one-sided t-tests (TOST), that the true mean is not within the margin.
+    """Return the p of two one-sided t-tests (TOST); null hypothesis: the mean is not in the margin.
 
     It is at most 0.05 if and only if the 90 % interval of the mean is within the margin.
 

@@ -155,7 +155,7 @@ class ReportStore:
 
 
 def _fuller(old: tuple[str, RecordedCell] | None, sweep_id: str, row: RecordedCell) -> RecordedCell:
-    """Return the row with a cell id of two rows for one run; refuse two different cells."""
+    """Return, of two rows for one run, the one with a cell id; refuse two different cells."""
     if old is None or old[1].cell_id is None:
         return row
     before, first = old

@@ -50,7 +50,7 @@ _QUALITIES = ((90, 0.40), (80, 0.22), (60, 0.13), (40, 0.09))
 _MAX_PIXELS = 1 << 24
 #: (cell's id, view) -> scores by name.
 _Scores = dict[tuple[str, str], dict[str, float | None]]
-#: The ratio of all pixels, with error maps, to the pixels of photographs and renders; about.
+#: The approximate ratio of all pixels, with error maps, to those of photographs and renders.
 _WITH_ERROR_MAPS = 1.25
 
 
@@ -224,9 +224,10 @@ def _entries(
 def _read(
     content: Content, store: ReportStore, cells: pd.DataFrame, view: str, title: str
 ) -> tuple[Image.Image, dict[int, Image.Image]] | None:
-    """Read a view's photograph, and its renders by the index of their cell; None without the first.
+    """Read a view's photograph, and its renders by the index of their cell.
 
-    A render that can't be read, or has another size than the photograph, is left out and noted.
+    A render that can't be read, or has another size than the photograph, is left out and noted. The
+    result is None if the photograph can't be read.
     """
     renders: dict[int, Image.Image] = {}
     try:
