@@ -155,8 +155,8 @@ class Race:
             self._add(start, run(start, steps, minutes))
 
     def _of(self, start: Start) -> list[Run]:
-        wanted = (start.size, start.scene, start.arm)
-        return [run for run in self.runs if (run.size, run.scene, run.arm) == wanted]
+        key = (start.size, start.scene, start.arm)
+        return [run for run in self.runs if (run.size, run.scene, run.arm) == key]
 
     def _add(self, start: Start, run_rows: Iterator[dict[str, Any]]) -> None:
         before, began = _cpu_seconds(), time.monotonic()

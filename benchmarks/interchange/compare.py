@@ -247,8 +247,8 @@ def _row(programs: Programs, program: str, file: Path) -> tuple[str, str, str]:
         return versions, f"refuses version 3: {error}", "-"
     ours = arrays(xrgs.load_gaussians(file).gaussians)
     missing = [name for name in ours if name not in theirs]
-    what = "all" if not missing else f"no {', no '.join(missing)}"
-    return ", ".join(filter(None, [versions, what])), _words(theirs, ours), _decibels(theirs, ours)
+    scope = "all" if not missing else f"no {', no '.join(missing)}"
+    return ", ".join(filter(None, [versions, scope])), _words(theirs, ours), _decibels(theirs, ours)
 
 
 def _words(theirs: Arrays, ours: Arrays) -> str:

@@ -77,10 +77,10 @@ def _aura_splat(file: Path) -> dict[str, Any]:
 
     samples = load_3dgs_ply(file)
     return {
-        "means": [of.mean for of in samples],
-        "covariances": [[of.covariance[i][k] for i, k in UPPER] for of in samples],
-        "opacities": [of.opacity for of in samples],
-        "colors": [of.color for of in samples],
+        "means": [sample.mean for sample in samples],
+        "covariances": [[sample.covariance[i][k] for i, k in UPPER] for sample in samples],
+        "opacities": [sample.opacity for sample in samples],
+        "colors": [sample.color for sample in samples],
     }
 
 
@@ -156,7 +156,7 @@ def _pygltflib(file: Path) -> dict[str, Any]:
 
     prefix = "KHR_gaussian_splatting:"
     bands = [
-        f"{prefix}SH_DEGREE_{band}_COEF_{of}" for band in (1, 2, 3) for of in range(2 * band + 1)
+        f"{prefix}SH_DEGREE_{band}_COEF_{n}" for band in (1, 2, 3) for n in range(2 * band + 1)
     ]
     return {
         "means": values("POSITION"),
@@ -217,7 +217,7 @@ def main() -> None:
         return
     read = READERS[program](file)
     out.write_text(
-        json.dumps({name: np.asarray(of, np.float64).tolist() for name, of in read.items()})
+        json.dumps({name: np.asarray(array, np.float64).tolist() for name, array in read.items()})
     )
 
 

@@ -60,13 +60,13 @@ def download(
     published: Any = OmegaConf.to_container(
         OmegaConf.load(config.CONF_DIR / "data" / f"{dataset}.yaml")
     )
-    given = {
+    arguments = {
         "url": url,
         "sha256": sha256,
         "max_bytes": max_bytes,
         "redirect_hosts": redirect_hosts,
     }
-    changes: Any = {key: value for key, value in given.items() if value is not None}
+    changes: Any = {key: value for key, value in arguments.items() if value is not None}
     root = data_root or Path(OmegaConf.load(config.CONF_DIR / "config.yaml").data_root)
     say(fetch_scenes(replace(DatasetConf(**published), **changes), scenes, root))
 
@@ -154,8 +154,8 @@ def export(
     path = user_path(name)
     is_other_path = path.name != name and not path.is_dir()
     if path.suffix.lower()[1:] not in SPLAT_FORMATS and not is_other_path:
-        there = Store(store)
-        path = path if path.is_dir() and not there.exists else there.find_folder(name)
+        home = Store(store)
+        path = path if path.is_dir() and not home.exists else home.find_folder(name)
     say(write_export(path, out, layout))
 
 
@@ -168,8 +168,8 @@ def form_of(out: Path) -> str:
     if (form := out.suffix.lower()[1:]) in SPLAT_FORMATS:
         return form
     if out.suffix:
-        known = ", ".join(f".{form}" for form in SPLAT_FORMATS)
-        raise XrgsError(f"out={out}: a file ends with {known}; a folder has no suffix")
+        suffixes = ", ".join(f".{form}" for form in SPLAT_FORMATS)
+        raise XrgsError(f"out={out}: a file ends with {suffixes}; a folder has no suffix")
     return "colmap"
 
 

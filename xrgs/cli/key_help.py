@@ -35,15 +35,15 @@ def explain(key: str) -> str:
     Raises:
         XrgsError: There is no such key; the message offers similar ones.
     """
-    known = entries()
-    found = [
+    keys = entries()
+    lines = [
         "\n  ".join([f"{name}={entry.value}" if entry.value else name, *entry.comment])
-        for name, entry in known.items()
+        for name, entry in keys.items()
         if f"{name}.".startswith(f"{key}.")
     ]
-    if not found:
-        raise XrgsError(f"help={key}: there is no such key{did_you_mean(key, known)}")
-    return "\n\n".join([*found, _WHERE])
+    if not lines:
+        raise XrgsError(f"help={key}: there is no such key{did_you_mean(key, keys)}")
+    return "\n\n".join([*lines, _WHERE])
 
 
 def entries() -> dict[str, Entry]:
@@ -52,7 +52,7 @@ def entries() -> dict[str, Entry]:
     Only the YAML of this file is understood: a key with its value on one line, and two more spaces
     of indent for the keys of a group.
     """
-    known: dict[str, Entry] = {}
+    result: dict[str, Entry] = {}
     path: list[str] = []
     above: list[str] = []
     content = read_file(config.CONF_DIR / "config.yaml").decode()
@@ -64,6 +64,6 @@ def entries() -> dict[str, Entry]:
             indent, name, value, behind = entry.groups()
             path = [*path[: len(indent) // 2], name]
             key = ".".join(path)
-            known[key] = Entry(value.strip(), (*above, *([behind] if behind else [])))
+            result[key] = Entry(value.strip(), (*above, *([behind] if behind else [])))
         above = []
-    return known
+    return result

@@ -91,12 +91,12 @@ def run(
     guard_streams()
     answer_version(command)
     functions = {command: target} if callable(target) else target
-    known = frozenset(name for function in functions.values() for name in _names(function))
+    names = frozenset(name for function in functions.values() for name in _names(function))
     name = "[a-z][a-z_]*"
     if overrides in {command, *sys.argv[1:2]}:
         name = "|".join({*_names(functions[overrides])} - {*known_keys()})
     assignment = re.compile(f"({name})=(.*)", re.DOTALL)
-    words = _with_options(sys.argv[1:], assignment, known)
+    words = _with_options(sys.argv[1:], assignment, names)
     with errors_as_messages(command, assignment):
         if callable(target):
             tyro.cli(
@@ -127,7 +127,7 @@ def _names(options: Any) -> Iterator[str]:
 
 
 def _with_options(
-    words: Sequence[str], assignment: re.Pattern[str], known: Container[str]
+    words: Sequence[str], assignment: re.Pattern[str], names: Container[str]
 ) -> list[str]:
     """Convert each `KEY=VALUE` of a command line, as for `xrgs-sweep`, to the option `--key VALUE`.
 
@@ -137,7 +137,7 @@ def _with_options(
     others, options = [], []  # options come last: only another option ends a list of values
     for number, word in enumerate(words):
         match = assignment.fullmatch(word)
-        is_value = match and match[1] not in known and any(w[:2] == "--" for w in words[:number])
+        is_value = match and match[1] not in names and any(w[:2] == "--" for w in words[:number])
         if not match or is_value:
             others.append(word)
             continue

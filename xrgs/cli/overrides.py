@@ -121,8 +121,8 @@ def _explained(error: Exception) -> str:
     offered = ""
     if isinstance(error, (ConfigKeyError, ConfigAttributeError)):
         parent = error.parent_node
-        known = tuple(map(str, parent)) if isinstance(parent, DictConfig) else ()
-        offered = did_you_mean(str(error.key), known)
+        choices = tuple(map(str, parent)) if isinstance(parent, DictConfig) else ()
+        offered = did_you_mean(str(error.key), choices)
     elif isinstance(error.__cause__, OmegaConfBaseException):  # it names the key and the value
         return _explained(error.__cause__)
     return composing.error_line(error) + offered
@@ -178,7 +178,7 @@ def _missing_file(file: str, options: Sequence[str]) -> str:
     """Return the message on a missing file `GROUP/NAME` of the config."""
     group = next((g for g in config.GROUPS if file.startswith(f"{g}/")), file.rpartition("/")[0])
     name = file.removeprefix(f"{group}/")
-    if not (known := sorted({*files(group), *options})):
+    if not (choices := sorted({*files(group), *options})):
         return f"{group}: there is no such key{did_you_mean(group, config.known_keys())}"
     if group == "scene" and user_path(name).is_dir():
         word = shlex.quote(f"scene.path={name}")
@@ -188,10 +188,10 @@ def _missing_file(file: str, options: Sequence[str]) -> str:
             f"ablation={name}: it is in a package of its own: pip install ./examples/arms, and"
             " xrgs-sweep --config-dir examples/arms/conf finds it"
         )
-    all_known = f"; choose from: {', '.join(known)}"
-    if len(known) > _MAX_LISTED:
-        all_known = f"; xrgs-sweep --help lists all {len(known)}"
-    offered = did_you_mean(name, known) or all_known
+    all_known = f"; choose from: {', '.join(choices)}"
+    if len(choices) > _MAX_LISTED:
+        all_known = f"; xrgs-sweep --help lists all {len(choices)}"
+    offered = did_you_mean(name, choices) or all_known
     return f"{group}={name}: there is no such choice{offered}"
 
 
@@ -206,17 +206,17 @@ def with_options_first(words: Sequence[str]) -> list[str]:
     """
     options: list[str] = []
     overrides: list[str] = []
-    left = list(words)
-    while left:
-        word = left.pop(0)
+    remaining = list(words)
+    while remaining:
+        word = remaining.pop(0)
         if not word.startswith("-"):
             overrides.append(word)
             continue
         name, _, value = word.partition("=")
-        if name in _HYDRA_VALUES - _INFO and not value and left:
-            value = left.pop(0)
+        if name in _HYDRA_VALUES - _INFO and not value and remaining:
+            value = remaining.pop(0)
         if name in _INFO and not value:
-            value = left.pop(0) if left and "=" not in left[0] else "all"
+            value = remaining.pop(0) if remaining and "=" not in remaining[0] else "all"
         if name in _FOLDERS and value:
             value = str(user_path(value))
         if name not in ("--multirun", "-m"):
@@ -291,8 +291,8 @@ def _exists(path: str) -> bool:
 def _literal(text: str) -> str:
     """Escape `${` in a text, unless each interpolation in it names a key or a resolver."""
     named = _INTERPOLATED.findall(text)
-    known = (name.startswith(("oc.", "hydra")) or name in config.known_keys() for name in named)
-    return text if named and all(known) else escape_interpolations(text)
+    valid = (name.startswith(("oc.", "hydra")) or name in config.known_keys() for name in named)
+    return text if named and all(valid) else escape_interpolations(text)
 
 
 def _parsed(word: str) -> Override | None:

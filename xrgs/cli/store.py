@@ -82,9 +82,9 @@ class Removal:
             return
         if not (self.yes or _confirmed(f"{plan.verb} {plan.total}?")):
             raise XrgsError("nothing was done; --yes does it without asking")
-        freed, left = carry_out(store, plan)
+        freed, remaining = carry_out(store, plan)
         say(f"freed {format_size(freed)}")
-        _say_left(left)
+        _say_left(remaining)
 
 
 def list_cells(cells: Filter, sort: Literal["name", "age", "size"] = "name") -> None:

@@ -177,9 +177,9 @@ def _rerun(arguments: list[str]) -> None:
         conf = OmegaConf.merge(OmegaConf.structured(RerunConf), texts(arguments))
         out, store = (user_path(path) if path else None for path in (conf.out, conf.store))
         photographs, plugins = conf.scene.path, conf.plugins.split(",")
-        cell, there = Path(conf.rerun), Store(store or DEFAULT_STORE)
-        if not cell.exists() and there.exists:
-            cell = there.find_cell(conf.rerun).path
+        cell, home = Path(conf.rerun), Store(store or DEFAULT_STORE)
+        if not cell.exists() and home.exists:
+            cell = home.find_cell(conf.rerun).path
         result = rerun(cell, out, store, conf.threads, photographs, plugins)
     say(str(result))
     if result.differences:

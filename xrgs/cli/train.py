@@ -135,18 +135,18 @@ def train(settings: Settings) -> None:
         trial = None
         if settings.minutes:
             trial = _trial(placed, words.compose())
-            left = 60 * settings.minutes - (time.monotonic() - begin) - trial.start_s
-            _choose_steps(words, settings, trial.step_s, left)
+            left_s = 60 * settings.minutes - (time.monotonic() - begin) - trial.start_s
+            _choose_steps(words, settings, trial.step_s, left_s)
         steps = words.compose().train.steps
         if steps < _LONG_RUN:
             words.own.append(f"splat.densify.every={_REFINED_EVERY * NOMINAL_STEPS // steps}")
         conf = words.compose()
         recipe = words.value("ablation") or BASELINE
-        what = f"{recipe}: {conf.train.steps:,} steps at {conf.variant.long_side} px"
+        description = f"{recipe}: {conf.train.steps:,} steps at {conf.variant.long_side} px"
         if _cell(placed, conf).state(verify=False).name == "done":
-            _say(f"trained already by {what}")
+            _say(f"trained already by {description}")
         else:
-            _say(f"training by {what}, {format_duration(_expected_s(placed, conf, trial))}")
+            _say(f"training by {description}, {format_duration(_expected_s(placed, conf, trial))}")
     again = "the command above continues" if settings.minutes else "run it again to continue"
     hint = f"What is done is kept: {again}."
     sweep.run("xrgs-train", [*words.all, "hydra.sweeper.brief=true"], hint)
@@ -155,13 +155,13 @@ def train(settings: Settings) -> None:
 
 def _words(settings: Settings) -> _Words:
     """Return the words that don't depend on the photographs."""
-    own = [*as_they_are(settings.photographs), f"store={settings.store}"]
-    own += ["retry=failed", "lpips.fetch=false", *_QUALITIES[settings.quality]]
-    own += [f"variant.long_side={settings.size}"] if settings.size is not None else []
-    own += ["variant.test_every=0"] if settings.hold_none else []
-    own += [f"scene.masks={settings.masks}"] if settings.masks else []
-    own += ["dry_run=true"] if settings.dry_run else []
-    return _Words(settings.overrides, own)
+    words = [*as_they_are(settings.photographs), f"store={settings.store}"]
+    words += ["retry=failed", "lpips.fetch=false", *_QUALITIES[settings.quality]]
+    words += [f"variant.long_side={settings.size}"] if settings.size is not None else []
+    words += ["variant.test_every=0"] if settings.hold_none else []
+    words += [f"scene.masks={settings.masks}"] if settings.masks else []
+    words += ["dry_run=true"] if settings.dry_run else []
+    return _Words(settings.overrides, words)
 
 
 @dataclass(frozen=True)

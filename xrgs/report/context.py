@@ -264,15 +264,15 @@ def decided_by_one_view(
         & (difference > _MIN_DB)
         & (pairs["distance"] > _MIN_DISTANCE * pairs["spread"])
     ]
-    found: dict[tuple[str, str], list[str]] = {}
+    notes: dict[tuple[str, str], list[str]] = {}
     for row in decided.to_dict("records"):
         text = (
             f"Caution: one view decides: on {row['scene']} (replicate"
             f" {row['variant_seed']}/{row['seed']}) PSNR changes by {signed(row['with_all'])} dB,"
             f" and without {row['view']} by {signed(row['without'])} dB"
         )
-        found.setdefault((row["label"], row["condition"]), []).append(for_line(text, _MAX_SENTENCE))
-    return found
+        notes.setdefault((row["label"], row["condition"]), []).append(for_line(text, _MAX_SENTENCE))
+    return notes
 
 
 def _changes_of_views(comparison: Comparison, views: pd.DataFrame) -> pd.DataFrame:

@@ -169,13 +169,13 @@ def _folder(program: External, cell: Mapping[Hashable, Any], done: pd.DataFrame)
             f"external={program.label}: {program.folder}: {error.strerror}"
         ) from error
     if not existing:
-        wanted = (
+        expected = (
             " or ".join(map(str, candidates))
             or "a folder of the scene, though its name can't be a folder's name,"
         )
         raise ReportError(
             f"external={program.label}: there are no renders of {scene} with variant.seed={draw}: "
-            f"{wanted} is expected, with <view>.png for each view that is scored"
+            f"{expected} is expected, with <view>.png for each view that is scored"
         )
     return existing[0]
 

@@ -86,12 +86,12 @@ class Runs:
     """Work that each cell skipped: `xrgs.report.work.skipped`."""
 
     @classmethod
-    def of(cls, sweep: Sweep, cells: pd.DataFrame) -> Runs:
+    def gather(cls, sweep: Sweep, cells: pd.DataFrame) -> Runs:
         """Gather the tables of a sweep's compared cells."""
         cells = cells[~cells["cell_id"].isin(sweep.renders)]  # nothing is known of other programs
         labels = cells.groupby("condition", sort=False)["label"].unique()
         return cls(
-            {str(name): list(of) for name, of in labels.items()},
+            {str(name): list(group) for name, group in labels.items()},
             work.totals(cells, sweep.done),
             curves.joined(cells, sweep.done),
             curves.times(cells, sweep.done),
@@ -199,7 +199,7 @@ def _write(
     """Write all files of a report; return its pictures."""
     (folder / "figures").mkdir(exist_ok=True)
     comparison = tables.comparison
-    runs = Runs.of(sweep, comparison.cells)
+    runs = Runs.gather(sweep, comparison.cells)
     drawn = draw(store, comparison, sweep.views, runs.curves, folder / "figures", pictures)
     _write_data(folder, sweep, comparison, runs)
     changes = _change_tables(tables)

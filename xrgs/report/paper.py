@@ -120,8 +120,8 @@ def why_no_table(labels: Iterable[str], scenes: Iterable[str]) -> str:
         labels: The labels of the sweep's cells.
         scenes: The names of the sweep's scenes.
     """
-    own = sorted({*scenes})
-    others, of_llff = [s for s in own if s not in _LLFF], [s for s in own if s in _LLFF]
+    names = sorted({*scenes})
+    others, of_llff = [s for s in names if s not in _LLFF], [s for s in names if s in _LLFF]
     if not (others and of_llff) or {*labels}.isdisjoint(_READINGS):
         return ""
     return (

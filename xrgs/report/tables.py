@@ -247,9 +247,9 @@ class Tables:
         rows = []
         for scene in sorted(done["scene"].unique()):
             for metric in self.comparison.metrics:
-                found = [means.get((scene, label)) for label in labels]
+                numbers = [means.get((scene, label)) for label in labels]
                 texts = [MISSING if v is None else number(v[metric.name], metric.unit)
-                         for v in found]  # fmt: skip
+                         for v in numbers]  # fmt: skip
                 rows.append((scene, metric.label, *texts))
         return TextTable(
             title=titled("Values, means over the replicates that are done", condition),

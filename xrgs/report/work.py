@@ -175,9 +175,9 @@ def skipped(cells: pd.DataFrame, done: Mapping[str, DoneCell]) -> pd.DataFrame:
     """
     rows = []
     for _, cell in cells[cells["cell_id"].isin(done)].drop_duplicates(CELL_KEYS).iterrows():
-        own = done[cell["cell_id"]]
-        work = _work(own)
-        for kind, number, whole, cost in _left_out(work, _work(done.get(cell["base_id"], own))):
+        run = done[cell["cell_id"]]
+        work = _work(run)
+        for kind, number, whole, cost in _left_out(work, _work(done.get(cell["base_id"], run))):
             if math.isnan(number) or not whole > 0:
                 continue
             unit = _kind(kind).unit
@@ -232,9 +232,9 @@ def _above_zero(value: float) -> float:
     return 0.0 if value < 0 else value
 
 
-def _times(number: float, amount: float, of: float) -> float:
-    """Return number * amount / of; NaN if `of` is 0 or NaN."""
-    return number * amount / of if of > 0 else math.nan
+def _times(number: float, amount: float, count: float) -> float:
+    """Return number * amount / count; NaN if `count` is 0 or NaN."""
+    return number * amount / count if count > 0 else math.nan
 
 
 def _kind(name: str) -> _Kind:

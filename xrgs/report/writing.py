@@ -239,12 +239,12 @@ def legend(comparison: Comparison, tables: Sequence[TextTable]) -> TextTable:
     )  # fmt: skip
     heads = {head for table in tables for head in table.columns}
     texts = {text for table in tables for row in table.rows for text in row}
-    found = tuple(
+    shown = tuple(
         (term, meaning)
         for term, head, mark, meaning in rows
         if head in heads or (mark and any(re.search(mark, text) for text in texts))
     )
-    return TextTable("How to read the tables", ("", "meaning"), found, "ll", prose=True)
+    return TextTable("How to read the tables", ("", "meaning"), shown, "ll", prose=True)
 
 
 def by_key(table: pd.DataFrame) -> dict[tuple[str, ...], Change]:

@@ -135,7 +135,7 @@ def _load(word: str, store: Store) -> Model:
     train = [PosedView(view.name, view.tag, view.camera) for view in data.train]
     test = [PosedView(view.name, "test", view.camera) for view in data.test]
     viewmats = [
-        np.stack([view.camera.viewmat.double().numpy() for view in of]) for of in (train, test)
+        np.stack([view.camera.viewmat.double().numpy() for view in part]) for part in (train, test)
     ]
     poses = Poses(viewmats[0], viewmats[1], data.points.double().numpy())
     names = store.cell_names().get(cell.id)
