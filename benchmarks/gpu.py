@@ -7,11 +7,11 @@ LLFF is the folder that has `fern` (`xrgs-data download llff fern`). It needs `x
 of NVIDIA and nvcc, and `xrgs-data lpips` for LPIPS. The first cell compiles gsplat's kernels, for
 some minutes.
 
-It prints a line a cell: recipe, backend, PSNR, LPIPS, Gaussians, and the seconds of training.
-With both backends it then prints, for each recipe, gsplat less native, and ends with code 1 where
-PSNR differs by more than 0.3 dB or the Gaussians by more than 5 %. These bounds are a guess: nobody
-has run this on a GPU yet. On the CPU the two backends differ by rounding only, where
-`gsplat_api.rasterization` stands in for gsplat (tests/training/test_gsplat.py).
+It prints a line for each cell: recipe, backend, PSNR, LPIPS, Gaussians, and seconds of training.
+With both backends it then prints the difference gsplat - native for each recipe, and ends with code
+1 if PSNR differs by more than 0.3 dB or the number of Gaussians by more than 5 %. These bounds are
+a guess: nobody has run this on a GPU yet. On the CPU, with `gsplat_api.rasterization` instead of
+gsplat, the backends differ only by rounding (tests/training/test_gsplat.py).
 """
 
 from __future__ import annotations
@@ -26,8 +26,9 @@ import pandas as pd
 
 import xrgs
 
-#: The largest alpha in gsplat 1.5.3's kernels; 1.6 has our default.
+#: The largest alpha of gsplat 1.5.3's kernels; that of 1.6 is our default.
 ALPHA_MAX = "splat.raster.alpha_max=0.999"
+#: The largest differences at which the backends count as equal: PSNR, dB; Gaussians, relative.
 LARGEST_DB, LARGEST_SHARE = 0.3, 0.05
 COLUMNS = ("psnr", "lpips", "gaussians", "training_time_s")
 
@@ -56,7 +57,7 @@ def main() -> None:
 
 
 def read(store: str) -> pd.DataFrame:
-    """Return the newest cell of each recipe and backend, indexed by these two."""
+    """Return the newest done cell of each recipe and backend, indexed by (label, backend)."""
     home = xrgs.Store(store)
     cells = home.cells().query("state == 'done'")
     cells["backend"] = [home.cell(cell_id).config().splat.backend for cell_id in cells["cell_id"]]
@@ -65,7 +66,7 @@ def read(store: str) -> pd.DataFrame:
 
 
 def compare(cells: pd.DataFrame) -> int:
-    """Print gsplat less native; return 1 where they differ by too much, else 0."""
+    """Print gsplat - native for each recipe; return 1 if a difference is too large, else 0."""
     native, gsplat = (cells.xs(name, level="backend") for name in ("native", "gsplat"))
     psnr, share = gsplat["psnr"] - native["psnr"], gsplat["gaussians"] / native["gaussians"] - 1
     for recipe in native.index:

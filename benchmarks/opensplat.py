@@ -1,8 +1,8 @@
-"""OpenSplat as a competitor of `race.py`: its data, its runs, and the scores of its .ply files.
+"""OpenSplat as a competitor in `race.py`: its data, its runs, and the scores of its .ply files.
 
-It trains on every image of a COLMAP model, so that its model has the training views of a variant
-alone. It moves and scales the world to the cameras; `--keep-crs` has it write the .ply in the world
-of the model, where our cameras are.
+It trains on every image of a COLMAP model, so we give it a model with only the training views of a
+variant. It moves and scales the world to the cameras; with `--keep-crs` it writes the .ply in the
+world of the model, where our cameras are.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from xrgs.splat.gaussians import Gaussians
     from xrgs.training.dataset import Dataset, LoadedView
 
-#: Where its renderer differs from ours: the colour behind the last Gaussian, and the cap of alpha.
+#: Settings in which its renderer differs from ours: background colour and largest alpha.
 _BACKGROUND, _ALPHA_MAX = (0.6130, 0.0101, 0.3984), 0.999
 _STEP = re.compile(r"Step (\d+): ")
 _WROTE = re.compile(r"Wrote (.*_\d+\.ply)$")
@@ -40,7 +40,7 @@ class Snapshot:
 
     steps: int
     seconds: float
-    """From the end of the first step to the loss of this one, without what writing took."""
+    """Seconds from the end of the first step to the loss of this one, without writing files."""
     file: Path
 
 
@@ -48,7 +48,7 @@ def version(binary: str) -> str:
     """Return the name and the version of the program.
 
     Raises:
-        SystemExit: It does not run.
+        SystemExit: The program does not run.
     """
     command = [binary, "--version"]
     try:
@@ -63,42 +63,42 @@ def write_training_views(data: Dataset, folder: Path) -> None:
 
     Args:
         data: The variant.
-        folder: The folder to write, in an existing one.
+        folder: The folder to write; its parent must exist.
     """
     if folder.exists():
         return
-    made = folder.with_name(f"{folder.name}.unfinished")
-    model = made / "sparse" / "0"
+    unfinished = folder.with_name(f"{folder.name}.unfinished")
+    model = unfinished / "sparse" / "0"
     model.mkdir(parents=True, exist_ok=True)
-    placed = []
+    placements = []
     for view in data.train:
         camera, name = view.camera, f"{view.name}.png"
-        images.save(made / "images" / name, view.image.numpy(), durable=False)
+        images.save(unfinished / "images" / name, view.image.numpy(), durable=False)
         K, viewmat = camera.K.double().numpy(), camera.viewmat.double().numpy()
-        placed.append(PinholeImage(name, camera.width, camera.height, K, viewmat))
+        placements.append(PinholeImage(name, camera.width, camera.height, K, viewmat))
     colors = (data.colors * 255).round().byte().numpy()
-    write_model(model, placed, data.points.double().numpy(), colors)
-    made.rename(folder)
+    write_model(model, placements, data.points.double().numpy(), colors)
+    unfinished.rename(folder)
 
 
 def train(
     binary: str, options: Sequence[str], every: int, limits_s: Sequence[float], out: Path
 ) -> dict[float, Snapshot]:
-    """Train until it ends, or until it has trained for longer than the largest limit.
+    """Run OpenSplat until it ends, or has trained for longer than the largest limit.
 
     Args:
         binary: The program.
-        options: Its options, with the folder of the data.
+        options: The program's options, with the folder of the data.
         every: Steps between two .ply files.
-        limits_s: Seconds of training.
-        out: An empty folder for its files.
+        limits_s: Limits of the training time, s.
+        out: An empty folder for the program's files.
 
     Returns:
-        The last .ply within each limit, by the limit, where there is one. Others are removed.
+        Limit -> the last .ply within it, if there is one. Other .ply files are removed.
 
     Raises:
-        SystemExit: It has failed, and the message has the end of what it said; or it has written
-            no .ply within a limit.
+        SystemExit: The program has failed (the message has the end of its output), or has written
+            no .ply within any limit.
     """
     saving = ("--keep-crs", "--save-every", str(every), "-o", str(out / "splat.ply"))
     errors = out / "stderr.txt"
@@ -113,7 +113,7 @@ def train(
             kept = snapshots(_timed(process.stdout), limits_s)
             failed = process.wait(timeout=1)
         except subprocess.TimeoutExpired:
-            failed = 0  # it has passed the limit, and trains on
+            failed = 0  # still training, but past the limit
         finally:
             process.kill()
     if failed:
@@ -126,17 +126,17 @@ def train(
 def snapshots(
     lines: Iterable[tuple[float, str]], limits_s: Sequence[float]
 ) -> dict[float, Snapshot]:
-    """Follow what a run prints, until it has trained for longer than the largest limit.
+    """Follow the output of a run, until it has trained for longer than the largest limit.
 
-    It prints a line with its loss at each step, and then a line for a .ply that it has written.
-    The optimizer's step in between counts as writing.
+    OpenSplat prints a line with the loss at each step, and a line after writing a .ply. The
+    optimizer's step in between counts as writing.
 
     Args:
-        lines: Its lines, each with the time at which it came, s.
-        limits_s: Seconds of training.
+        lines: The lines of the output, each with the time of its arrival, s.
+        limits_s: Limits of the training time, s.
 
     Returns:
-        As `train`.
+        As for `train`.
     """
     kept: dict[float, Snapshot] = {}
     started, steps, seconds, writing = 0.0, 0, 0.0, 0.0
@@ -149,10 +149,10 @@ def snapshots(
         elif wrote := _WROTE.match(line):
             writing = now - started - seconds  # of all files so far
             before = set(kept.values())
-            made = Snapshot(steps, seconds, Path(wrote[1]))
-            kept |= dict.fromkeys((limit for limit in limits_s if seconds <= limit), made)
-            for one in before - set(kept.values()):
-                one.file.unlink()
+            snapshot = Snapshot(steps, seconds, Path(wrote[1]))
+            kept |= dict.fromkeys((limit for limit in limits_s if seconds <= limit), snapshot)
+            for old in before - set(kept.values()):
+                old.file.unlink()
     return kept
 
 
@@ -164,18 +164,18 @@ def _timed(stream: IO[str]) -> Iterator[tuple[float, str]]:
 def score(
     gaussians: Gaussians, views: Sequence[LoadedView], conf: SplatConf, renders: Path
 ) -> dict[str, float]:
-    """Score Gaussians of OpenSplat on test views as our own, with the settings of its renderer.
+    """Score Gaussians of OpenSplat on test views, with our metrics and its renderer's settings.
 
-    Its renderer takes the middle of an image for the principal point.
+    Its renderer assumes the principal point in the middle of the image.
 
     Args:
         gaussians: The Gaussians of a .ply.
         views: The test views.
         conf: The settings of one of our cells.
-        renders: The folder for the renders, made where it is missing.
+        renders: The folder for the renders, made if it is missing.
 
     Returns:
-        The mean of each score over the views; NaN where it can't be computed.
+        Score -> its mean over the views; NaN if it can't be computed.
     """
     raster = replace(conf.raster, background=_BACKGROUND, alpha_max=_ALPHA_MAX, antialiased=False)
     centred = [replace(view, camera=_centred(view)) for view in views]

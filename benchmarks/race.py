@@ -1,14 +1,14 @@
-"""The race: the quality that arms, and OpenSplat, reach within minutes of training on two cores.
+"""The race: which quality our arms and OpenSplat reach within minutes of training on two cores.
 
     python benchmarks/race.py FOLDER data_root=DATA --opensplat PATH
     python benchmarks/race.py FOLDER --table docs/speed.md
 
-The first trains and scores, one scene after another, all arms in turn within each budget of
-minutes, and goes on where it was stopped. Each run is planned: its schedules shrink to its number
-of steps, which is chosen by the seconds that shorter runs of the same arm and scene took. FOLDER
-gets a row for each run (`race.csv`), tables (`table.md`), a picture (`race.png`) and the store. The
-second makes tables and picture anew, and puts the tables between the two `race` comments of a page.
-Words with `=` are given to `xrgs-sweep`.
+The first command trains and scores: for each scene and each budget of minutes, all arms in turn. It
+continues where it was stopped. Each run has a planned number of steps, to which its schedules are
+scaled; the number follows from the seconds of shorter runs of the same arm and scene. FOLDER gets a
+row for each run (`race.csv`), tables (`table.md`), a picture (`race.png`) and the store. The second
+command makes tables and picture again, and puts the tables between the two `race` comments of a
+page. Words with `=` are passed to `xrgs-sweep`.
 """
 
 from __future__ import annotations
@@ -49,35 +49,36 @@ _SEVEN = (
     *("llff/fern", "llff/flower", "llff/fortress"),
     *("llff/horns", "llff/orchids", "llff/room", "llff/trex"),
 )
-#: Minutes and scenes by the longer side of a photograph, px.
+#: Longer side of a photograph, px -> budgets in minutes, and scenes.
 RACES = {
     504: ((1.0, 3.0, 10.0), _SEVEN),
     1008: ((10.0, 30.0), ("llff/fern", "llff/horns", "llff/room", "llff/trex")),
 }
 ARMS = ("fast", "plus", "lean", "tuned_baseline", BASELINE)
-#: OpenSplat as it is, stopped at each budget; and with the steps and the schedules for a budget.
+#: OpenSplat with its defaults, stopped at each budget; and with steps and schedules for a budget.
 PEERS = ("opensplat", "opensplat_planned")
-#: Steps between two .ply files of the first.
+#: Steps between two .ply files of `opensplat`.
 _PEER_EVERY = 10
-#: Of the second: its options that are numbers of steps, with their defaults.
+#: Options of OpenSplat in steps -> their defaults, which `opensplat_planned` scales.
 _PEER_SCHEDULES = {
     "resolution-schedule": 3000,
     "sh-degree-interval": 1000,
     "warmup-length": 500,
     "stop-screen-size-at": 4000,
 }
+#: Steps of the first run of an arm on a scene.
 _PROBE_STEPS = 200
-#: A run fits that takes this share of its budget or more, and not more than the budget.
+#: A run fits a budget if it takes at least _LEAST and at most all of it; runs are planned for _AIM.
 _LEAST, _AIM = 0.85, 0.93
-#: Runs of half to twice a budget after which the longest within it has to do.
+#: After this many runs of half to twice a budget, the longest run within the budget is taken.
 _MOST_TRIES = 3
-#: How many times as long as another run a run may be planned.
+#: A run is planned for at most this many times the seconds of another run.
 _MOST_TIMES = 6
 
 
 @dataclass(frozen=True)
 class Start:
-    """What a run trains on, and how."""
+    """The arm and the scene of a run, and the longer side of its photographs, px."""
 
     size: int
     scene: str
@@ -87,9 +88,9 @@ class Start:
 def plan(runs: Sequence[Run], minutes: float, probe_steps: int = _PROBE_STEPS) -> int | None:
     """Choose the number of steps of the next run for a budget.
 
-    The seconds of a run grow with a power of its steps: by the two runs that are nearest to the
-    budget, or 1 where there is one run. A run is planned for some times the seconds of another at
-    most, so that a large budget has several short runs before it.
+    The seconds of a run are taken to grow with a power of its steps: fitted to the two runs nearest
+    to the budget, or 1 if there is one run. A run is planned for at most `_MOST_TIMES` the seconds
+    of another, so that a large budget has several short runs before it.
 
     Args:
         runs: The runs of one arm on one scene so far.
@@ -97,8 +98,8 @@ def plan(runs: Sequence[Run], minutes: float, probe_steps: int = _PROBE_STEPS) -
         probe_steps: Steps of the first run.
 
     Returns:
-        The steps; None where a run fits, or where one is within the budget and enough others came
-        close to it.
+        The steps; None if a run fits the budget, or if one is within the budget and enough others
+        came close to it.
     """
     budget = 60 * minutes
     if not runs:
@@ -119,12 +120,12 @@ def plan(runs: Sequence[Run], minutes: float, probe_steps: int = _PROBE_STEPS) -
 
 
 class Race:
-    """The runs so far, and how further ones are made.
+    """The runs so far, and methods for further runs.
 
     Args:
         folder: The folder of the race.
         words: Words for `xrgs-sweep`.
-        peer: The path of OpenSplat; empty without it.
+        peer: The path of OpenSplat; empty to race without it.
         probe_steps: Steps of the first run of an arm on a scene.
     """
 
@@ -141,25 +142,25 @@ class Race:
         """Train an arm on a scene until it has a run for a budget.
 
         Args:
-            start: The arm and the scene.
+            start: The arm, the scene and the size.
             budgets: All budgets of the size, minutes.
             minutes: The budget.
         """
         if start.arm == PEERS[0]:
             if not any(run.minutes == max(budgets) for run in self._of(start)):
-                self._add(start, self._as_it_is(start, budgets))
+                self._add(start, self._with_defaults(start, budgets))
             return
         run = self._planned if start.arm in PEERS else self._ours
         while steps := plan(self._of(start), minutes, self.probe_steps):
             self._add(start, run(start, steps, minutes))
 
     def _of(self, start: Start) -> list[Run]:
-        wanted = (start.size, start.scene, start.arm)
-        return [run for run in self.runs if (run.size, run.scene, run.arm) == wanted]
+        key = (start.size, start.scene, start.arm)
+        return [run for run in self.runs if (run.size, run.scene, run.arm) == key]
 
-    def _add(self, start: Start, made: Iterator[dict[str, Any]]) -> None:
+    def _add(self, start: Start, run_rows: Iterator[dict[str, Any]]) -> None:
         before, began = _cpu_seconds(), time.monotonic()
-        rows = list(made)
+        rows = list(run_rows)
         others = (_cpu_seconds() - before) / (time.monotonic() - began)
         for row in rows:
             program = self.programs[start.arm in PEERS]
@@ -170,7 +171,7 @@ class Race:
         write_text(self.folder / race_table.RUNS, table_text([asdict(run) for run in self.runs]))
 
     def _ours(self, start: Start, steps: int, minutes: float) -> Iterator[dict[str, Any]]:
-        """Yield the row of a run of our own."""
+        """Train one of our arms; yield the row of the run."""
         arm = [] if start.arm == BASELINE else [f"+ablation={start.arm}", "baseline=false"]
         size = [f"variant.long_side={start.size}", "variant.sfm.reference=false"]
         words = ["preset=laptop", *size, f"train.steps={steps}", *arm, f"scene={start.scene}"]
@@ -196,13 +197,13 @@ class Race:
             **{name: metrics.get(name, math.nan) for name in race_table.SCORES},
         }
 
-    def _as_it_is(self, start: Start, budgets: Sequence[float]) -> Iterator[dict[str, Any]]:
-        """Yield a row for the last .ply within each budget of one long run of OpenSplat."""
+    def _with_defaults(self, start: Start, budgets: Sequence[float]) -> Iterator[dict[str, Any]]:
+        """Run OpenSplat once with its defaults; yield a row for the last .ply in each budget."""
         options = ("-n", str(NOMINAL_STEPS))
         yield from self._peer(start, options, _PEER_EVERY, {60 * m: m for m in budgets})
 
     def _planned(self, start: Start, steps: int, minutes: float) -> Iterator[dict[str, Any]]:
-        """Yield the row of a run of OpenSplat whose schedules have shrunk to its steps."""
+        """Run OpenSplat with schedules scaled to the steps; yield the row of the run."""
         options = ["-n", str(steps)]
         for name, nominal in _PEER_SCHEDULES.items():
             options += [f"--{name}", str(max(1, round(nominal * steps / NOMINAL_STEPS)))]
@@ -211,9 +212,9 @@ class Race:
     def _peer(
         self, start: Start, options: Sequence[str], every: int, minutes: Mapping[float, float]
     ) -> Iterator[dict[str, Any]]:
-        """Yield the rows of a run of OpenSplat; `minutes` has the budget of each limit in s."""
+        """Run OpenSplat; yield the rows. `minutes` maps each limit, s, to its budget."""
         cells = {(run.size, run.scene): run.cell for run in self.runs if run.cell}
-        cell = self.store.cell(cells[start.size, start.scene])  # any: they have one variant
+        cell = self.store.cell(cells[start.size, start.scene])  # any cell: they share a variant
         data, conf = dataset.load(cell.variant()), cell.config()
         folder = self.folder / "opensplat" / str(start.size)
         photographs = folder / "data" / conf.scene.name
@@ -221,21 +222,21 @@ class Race:
         opensplat.write_training_views(data, photographs)
         options = (str(photographs), *options)
         out = folder / "running"
-        shutil.rmtree(out, ignore_errors=True)  # of a run that was stopped
+        shutil.rmtree(out, ignore_errors=True)  # files of a stopped run
         out.mkdir()
         kept = opensplat.train(self.peer, options, every, list(minutes), out)
-        for made, limit in {kept[limit]: limit for limit in sorted(kept)}.items():
-            gaussians = load_ply(made.file)
+        for snapshot, limit in {kept[limit]: limit for limit in sorted(kept)}.items():
+            gaussians = load_ply(snapshot.file)
             renders = folder / f"{start.arm}-{minutes[limit]:g}min" / conf.scene.name
             scores = opensplat.score(gaussians, data.test, conf.splat, renders)
-            took = {"training_time_s": made.seconds, "gaussians": len(gaussians)}
-            write_json(renders / FIGURES, took)
+            figures = {"training_time_s": snapshot.seconds, "gaussians": len(gaussians)}
+            write_json(renders / FIGURES, figures)
             yield {
                 "minutes": minutes[limit],
-                "steps": made.steps,
-                "seconds": made.seconds,
+                "steps": snapshot.steps,
+                "seconds": snapshot.seconds,
                 "gaussians": len(gaussians),
-                "bytes": made.file.stat().st_size,
+                "bytes": snapshot.file.stat().st_size,
                 **{name: scores[name] for name in race_table.SCORES},
             }
         shutil.rmtree(out)
@@ -261,7 +262,7 @@ def main() -> None:
 
 
 def race(args: argparse.Namespace) -> None:
-    """Train what lacks, on the first two of the cores that this process may use."""
+    """Train the missing runs, on the first two cores that this process may use."""
     cores = sorted(os.sched_getaffinity(0))[:CORES]
     if len(cores) < CORES:
         raise SystemExit(f"the race is of {CORES} cores, this process may use {len(cores)}")
@@ -284,8 +285,8 @@ def _cpu_seconds() -> float:
     """Return the CPU seconds of all other programs on this machine."""
     now = psutil.cpu_times()
     busy: float = now.user + now.nice + now.system + now.irq + now.softirq + now.steal
-    ours = [resource.getrusage(of) for of in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    return busy - sum(used.ru_utime + used.ru_stime for used in ours)
+    usages = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return busy - sum(used.ru_utime + used.ru_stime for used in usages)
 
 
 if __name__ == "__main__":

@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 
 RUNS = "race.csv"
 SCORES = ("psnr", "ssim", "lpips")
-#: Other programs take less than this many cores on a machine that is quiet enough; our choice.
+#: A race counts only if other programs used at most this many cores meanwhile; our choice.
 QUIET = 0.1
-#: How the values of a file become those of a run.
+#: Type of a field of `Run` -> the function that converts a text of the file.
 _KINDS = {"int": int, "float": float, "str": str}
 _MEANS = ("steps", "seconds", "gaussians", "psnr", "lpips")
 _PANELS = {"psnr": "PSNR, dB", "lpips": "LPIPS"}
@@ -49,27 +49,27 @@ class Run:
     scene: str
     arm: str
     minutes: float
-    """The budget for which it was planned, or made to plan another."""
+    """The budget for which the run was planned, or for which it helped to plan another."""
     steps: int
     seconds: float
-    """What its training took, without loading, writing and scoring."""
+    """Seconds of training, without loading, writing and scoring."""
     psnr: float
     ssim: float
     lpips: float
-    """Means over the test views; NaN where there are no weights of LPIPS."""
+    """Means over the test views (also psnr, dB, and ssim); lpips is NaN without its weights."""
     gaussians: int
     bytes: int
     """The size of the .ply file."""
     others: float
-    """Cores that other programs used meanwhile."""
+    """Mean number of cores that other programs used during the run."""
     machine: str
     program: str
     cell: str = ""
-    """The id of the cell of a run of our own."""
+    """The id of our cell; empty for OpenSplat."""
 
 
 def read(folder: Path) -> list[Run]:
-    """Read the runs of a race; none where it has not begun.
+    """Read the runs of a race; none if it has not begun.
 
     Raises:
         StoreError: The file is damaged.
@@ -85,21 +85,21 @@ def read(folder: Path) -> list[Run]:
 
 
 def line(run: Run) -> str:
-    """Describe a run in a line."""
+    """Describe a run in one line."""
     where = f"{run.size} px, {run.scene}, {run.arm}"
-    made = f"{run.steps} steps in {run.seconds:.1f} s of {60 * run.minutes:.0f}"
+    speed = f"{run.steps} steps in {run.seconds:.1f} s of {60 * run.minutes:.0f}"
     scores = f"{run.psnr:.2f} dB, LPIPS {run.lpips:.3f}, {run.gaussians} Gaussians"
-    return f"{where}: {made}: {scores}; other programs took {run.others:.2f} cores"
+    return f"{where}: {speed}: {scores}; other programs took {run.others:.2f} cores"
 
 
 def chosen(runs: Sequence[Run], size: int, minutes: float) -> dict[tuple[str, str], Run]:
-    """Return the longest run within a budget, by arm and scene."""
+    """Return (arm, scene) -> the longest run within a budget."""
     within = [run for run in runs if run.size == size and run.seconds <= 60 * minutes]
     return {(run.arm, run.scene): run for run in sorted(within, key=lambda run: run.seconds)}
 
 
 def budgets(runs: Sequence[Run]) -> list[tuple[int, float]]:
-    """Return the sizes and the minutes of a race, in order."""
+    """Return the (size, minutes) of a race, in order."""
     return sorted({(run.size, run.minutes) for run in runs})
 
 
@@ -108,12 +108,12 @@ def write(folder: Path, page: Path | None, against: str) -> None:
 
     Args:
         folder: The folder of the race.
-        page: A Markdown page with a place for them; None for none.
-        against: The arm that others are compared with; empty for OpenSplat, or without it for the
-            baseline.
+        page: A Markdown page with the two `race` comments; None for no page.
+        against: The arm that others are compared with; empty for OpenSplat or, if it was not run,
+            the baseline.
 
     Raises:
-        SystemExit: The race has no run, or the page no place.
+        SystemExit: The race has no run, or the page lacks the comments.
     """
     runs = read(folder)
     if not runs:
@@ -144,18 +144,18 @@ def table(runs: Sequence[Run], size: int, minutes: float, base: str) -> TextTabl
         minutes: The budget.
         base: The arm that others are compared with.
     """
-    found = chosen(runs, size, minutes)
+    longest = chosen(runs, size, minutes)
     rows = []
     for arm in dict.fromkeys(run.arm for run in runs if run.size == size):
-        own = [run for (name, _), run in found.items() if name == arm]
-        if not own:
+        arm_runs = [run for (name, _), run in longest.items() if name == arm]
+        if not arm_runs:
             rows.append((arm, "0", *[""] * 7))
             continue
-        mean = {name: fmean(getattr(run, name) for run in own) for name in _MEANS}
+        mean = {name: fmean(getattr(run, name) for run in arm_runs) for name in _MEANS}
         scores = (f"{mean['psnr']:.2f}", f"{mean['lpips']:.3f}")
         counts = (f"{mean[name]:,.0f}" for name in ("steps", "seconds", "gaussians"))
-        changes = (_change(found, arm, base, score) for score in ("psnr", "lpips"))
-        rows.append((arm, str(len(own)), *counts, *scores, *changes))
+        changes = (_change(longest, arm, base, score) for score in ("psnr", "lpips"))
+        rows.append((arm, str(len(arm_runs)), *counts, *scores, *changes))
     return TextTable(
         title=f"{minutes:g} min of training, {size} px",
         columns=(
@@ -167,13 +167,13 @@ def table(runs: Sequence[Run], size: int, minutes: float, base: str) -> TextTabl
     )
 
 
-def _change(found: Mapping[tuple[str, str], Run], arm: str, base: str, score: str) -> str:
-    """Write the mean change of a score over scenes, its 95 % interval, and how many gain."""
-    scenes = [scene for name, scene in found if name == arm and (base, scene) in found]
+def _change(longest: Mapping[tuple[str, str], Run], arm: str, base: str, score: str) -> str:
+    """Write the mean change of a score over scenes, its 95 % interval, and how many improve."""
+    scenes = [scene for name, scene in longest if name == arm and (base, scene) in longest]
     if arm == base or not scenes:
         return ""
     values = [
-        np.array([getattr(found[name, scene], score) for scene in scenes]) for name in (base, arm)
+        np.array([getattr(longest[name, scene], score) for scene in scenes]) for name in (base, arm)
     ]
     is_ratio = score == "lpips"
     changes, _ = (log_ratio if is_ratio else difference)(*values)
@@ -188,7 +188,7 @@ def _change(found: Mapping[tuple[str, str], Run], arm: str, base: str, score: st
 
 
 def notes(runs: Sequence[Run]) -> list[str]:
-    """Say what the numbers depend on, in lines of Markdown."""
+    """Return Markdown lines on machine, programs and averages, for the reader of the tables."""
     programs = ", ".join(dict.fromkeys(run.program for run in runs))
     lines = [
         f"- {runs[0].machine}; {programs}.",
@@ -220,10 +220,10 @@ def _draw(axes: Axes, runs: Sequence[Run], size: int, score: str) -> None:
     times = [minutes for at, minutes in budgets(runs) if at == size]
     means: dict[str, list[tuple[float, float]]] = {}
     for minutes in times:
-        found = chosen(runs, size, minutes)
-        for arm in dict.fromkeys(arm for arm, _ in found):
-            own = [getattr(run, score) for (name, _), run in found.items() if name == arm]
-            means.setdefault(arm, []).append((minutes, fmean(own)))
+        longest = chosen(runs, size, minutes)
+        for arm in dict.fromkeys(arm for arm, _ in longest):
+            values = [getattr(run, score) for (name, _), run in longest.items() if name == arm]
+            means.setdefault(arm, []).append((minutes, fmean(values)))
     for (arm, points), mark in zip(sorted(means.items()), itertools.cycle(_MARKS)):
         axes.plot(*zip(*points, strict=True), marker=mark, label=arm)
     axes.set(xscale="log", xticks=times, xticklabels=[f"{minutes:g}" for minutes in times])

@@ -2,9 +2,9 @@
 
     python benchmarks/store.py 10000
 
-One cell is trained. The others are copies of it under the ids of a plan, with seeds of their own;
-all files but `identity.json` and `status.json` are hard links. The commands then run as a user runs
-them, in a temporary folder below the current one.
+One cell is trained. The others are its copies under the ids of a plan, with other seeds; all files
+except `identity.json` and `status.json` are hard links. Then the commands run as for a user, in a
+temporary folder below the current one.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def main() -> None:
 
 
 def measure(folder: Path, cells: int) -> dict[str, tuple[float, float]]:
-    """Return the seconds and CPU seconds of each command over a store of many cells."""
+    """Return command -> (seconds, CPU seconds), over a store of this many cells."""
     axes = (f"+ablation={','.join(LABELS)}", f"seed=range(0,{cells // 5})", *CELL)
     run(folder, "sweep", *CELL)
     template = next((folder / "store" / "cells").iterdir())
@@ -82,7 +82,7 @@ def copy(template: Path, cell: Path, seed: int) -> None:
 
 
 def run(folder: Path, command: str, *arguments: str) -> tuple[str, float, float]:
-    """Run `xrgs-<command>`; return its stderr, and the seconds and CPU seconds that it took."""
+    """Run `xrgs-<command>`; return its stderr, seconds and CPU seconds."""
     script = f"from xrgs.cli.{command} import main; main()"
     start, before = time.perf_counter(), cpu_seconds()
     done = subprocess.run(  # noqa: S603
@@ -98,7 +98,7 @@ def run(folder: Path, command: str, *arguments: str) -> tuple[str, float, float]
 
 
 def cpu_seconds() -> float:
-    """Return the CPU seconds of all children that have ended."""
+    """Return the CPU seconds of all ended child processes."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 

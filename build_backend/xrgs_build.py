@@ -1,13 +1,12 @@
 """The build backend: scikit-build-core, with a compiler from PyPI where the machine has none.
 
-The kernels need a C++17 compiler. Where none is found, the wheels of `ziglang`, which contain clang
-and the C++ library, are added to what the build requires, and CMake is given that compiler. Where
-the variable CXX names a compiler, that one is used or none: CXX=/nonexistent installs the package
-without kernels. A build that fails, for whatever reason, leaves a package that renders with torch
-(`if.failed` in pyproject.toml).
+The kernels need a C++17 compiler. If none is found, the build requires the wheels of `ziglang`,
+which contain clang and the C++ library, and CMake uses that compiler. If the variable CXX names a
+compiler, no other is tried: CXX=/nonexistent installs the package without kernels. If the build of
+the kernels fails for any reason, the package renders with torch (`if.failed` in pyproject.toml).
 
-An sdist or a wheel that is built from a checkout has `xrgs/_commit.json`: the commit, and a hash of
-what differs from it. A wheel that is built from an sdist has the file of the sdist.
+An sdist or a wheel built from a checkout has `xrgs/_commit.json`: the commit, and a hash of
+uncommitted changes. A wheel built from an sdist has the sdist's file.
 """
 
 from __future__ import annotations
@@ -42,10 +41,11 @@ __all__ = [
 
 #: Zig's command line changes between minor versions.
 ZIGLANG = "ziglang>=0.17.1,<0.18"
-#: Machines on which the kernels were built with it.
+#: The system and the machines on which ziglang has built the kernels.
 _ZIGLANG_SYSTEM, _ZIGLANG_MACHINES = "Linux", ("x86_64", "aarch64")
-#: In the order in which CMake tries them.
+#: Compilers, in the order in which CMake tries them.
 _COMPILERS = ("c++", "g++", "clang++")
+#: A source that a working C++17 compiler and its library must compile.
 _TRIAL = """\
 #include <optional>
 #include <stdexcept>
@@ -54,12 +54,12 @@ int trial(std::optional<int> value) {
   return *value;
 }
 """
-#: With a target, Zig takes the C library's headers from its own wheel, where a machine without a
-#: compiler seldom has any, and compiles for any processor of that architecture. All wheels of torch
-#: need this glibc or a newer one.
+#: With a target, Zig takes the C library's headers from its own wheel (machines without a compiler
+#: seldom have any) and compiles for all processors of the architecture. All wheels of torch need
+#: this glibc or a newer one.
 _TARGET = "{machine}-linux-gnu.2.28"
 #: Debian's Python.h includes a header relative to /usr/include. Without an optimization level, as
-#: where CMake tries the compiler, Zig adds checks that need a library of their own.
+#: in CMake's trial of the compiler, Zig adds checks that need an extra library.
 _CLANG_OPTIONS = ("-mcpu=baseline", "-idirafter", "/usr/include", "-fno-sanitize=undefined")
 
 _ROOT = Path(__file__).resolve().parents[1]
@@ -107,19 +107,20 @@ def build_editable(
 
 @contextlib.contextmanager
 def _commit_file() -> Iterator[None]:
-    """Write the commit of the checkout into the package for a while; do nothing elsewhere.
+    """Write the commit of a checkout into the package during a `with` block.
 
-    Nothing is written into a checkout that is read-only: the package then has no commit.
+    Outside of a checkout nothing is written. If the checkout is read-only, the package has no
+    commit.
     """
     source = _ROOT / "xrgs" / "store" / "commit.py"
-    commit = runpy.run_path(str(source))  # the package itself needs what a build does not have
-    found = commit["of_checkout"](_ROOT)
-    if found is None:
+    commit = runpy.run_path(str(source))  # `import xrgs` needs packages that a build lacks
+    content = commit["of_checkout"](_ROOT)
+    if content is None:
         yield
         return
     file = _ROOT / "xrgs" / commit["FILE"]
     try:
-        file.write_text(json.dumps(found), "utf-8")
+        file.write_text(json.dumps(content), "utf-8")
     except OSError as error:
         _say(f"{file}: {error.strerror}: the package will not know its commit")
         yield
@@ -134,7 +135,7 @@ def find_compiler() -> str | None:
     """Return the command of a C++17 compiler: CXX if that is set, else the first that works.
 
     Returns:
-        The command, in which CXX may have options; None if no compiler works.
+        The command, with the options in CXX; None if no compiler works.
     """
     named = os.environ.get("CXX", "").strip()
     candidates = [named] if named else [path for name in _COMPILERS if (path := shutil.which(name))]
@@ -142,7 +143,7 @@ def find_compiler() -> str | None:
 
 
 def _compiles(command: str) -> bool:
-    """Return whether a compiler makes a shared library of a C++17 source."""
+    """Return whether a compiler builds a shared library from a C++17 source."""
     with tempfile.TemporaryDirectory(prefix="xrgs-build-") as folder:
         source = Path(folder, "trial.cpp")
         source.write_text(_TRIAL, "utf-8")
@@ -156,15 +157,15 @@ def _compiles(command: str) -> bool:
 
 
 def _required_compiler() -> list[str]:
-    """Return the requirement of a compiler from PyPI where the machine has none."""
-    served = platform.system() == _ZIGLANG_SYSTEM and platform.machine() in _ZIGLANG_MACHINES
+    """Return the requirement of a compiler from PyPI, if the machine has none."""
+    supported = platform.system() == _ZIGLANG_SYSTEM and platform.machine() in _ZIGLANG_MACHINES
     named = os.environ.get("CXX", "").strip()
-    return [ZIGLANG] if served and not named and find_compiler() is None else []
+    return [ZIGLANG] if supported and not named and find_compiler() is None else []
 
 
 @contextlib.contextmanager
 def _compiler() -> Iterator[None]:
-    """Set CXX to the compiler that works, or to clang of `ziglang` where that is installed."""
+    """Set CXX to a compiler that works, or else to clang of `ziglang`, if installed."""
     with tempfile.TemporaryDirectory(prefix="xrgs-build-") as folder:
         named = os.environ.get("CXX", "").strip()
         if (compiler := find_compiler()) is not None:
@@ -185,15 +186,15 @@ def _compiler() -> Iterator[None]:
 
 
 def ziglang_compiler(folder: Path) -> dict[str, str]:
-    """Write the commands of a compiler that call `ziglang`.
+    """Write scripts `cc`, `c++`, `ar` and `ranlib` that call `ziglang`.
 
-    CMake looks for `ar` and `ranlib`, which may be missing as well, beside the compiler.
+    CMake looks for `ar` and `ranlib`, which may be missing too, beside the compiler.
 
     Args:
-        folder: An empty folder for the commands and for the libraries that Zig compiles.
+        folder: An empty folder for the scripts and for the libraries that Zig compiles.
 
     Returns:
-        Environment variables with which CMake uses them.
+        Environment variables with which CMake uses the scripts.
     """
     clang = ["-target", _TARGET.format(machine=platform.machine()), *_CLANG_OPTIONS]
     for name, options in {"cc": clang, "c++": clang, "ar": [], "ranlib": []}.items():
@@ -208,7 +209,7 @@ def ziglang_compiler(folder: Path) -> dict[str, str]:
 
 @contextlib.contextmanager
 def _environment(variables: Mapping[str, str]) -> Iterator[None]:
-    """Set environment variables for a while."""
+    """Set environment variables during a `with` block."""
     before = {name: os.environ.get(name) for name in variables}
     os.environ.update(variables)
     try:

@@ -3,8 +3,8 @@
     python examples/close_gaussians.py CELL --store xrgs-store --image with-and-without.png
 
 Gaussians that hang between the cameras and the scene ("floaters") are seen by few training views,
-and hide the scene where a test view sees them. Here a Gaussian is close where its depth is at most
-a share of the median depth of the SfM points before that camera; the near plane leaves it out.
+and hide the scene in test views. Here a Gaussian is close if its depth is at most a share of the
+median depth of the SfM points in front of the camera; a larger near plane leaves it out.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 @torch.no_grad()
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Print a line for each test view of the cell, and their mean."""
+    """Print the scores of each test view of the cell, and their means."""
     options = parse(arguments)
     cell = xrgs.Store(options.store).find_cell(options.cell)
     data, gaussians, conf = cell.dataset(), cell.gaussians(), cell.config().splat

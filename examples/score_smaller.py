@@ -1,11 +1,11 @@
-"""Score cells on their test photographs brought down to a smaller size.
+"""Score cells on their test photographs, reduced to a smaller size.
 
     python examples/score_smaller.py CELL CELL --store xrgs-store --factor 5
 
 `full` are the scores at the full size. For the others each test photograph is averaged over squares
-of pixels: `averaged` compares it with the render of the full size, averaged in the same way, and
-`rendered` with a render of the smaller size. The latter is what a protocol would do that degrades
-its test photographs as it degrades the training photographs.
+of pixels: `averaged` compares it with the full-size render, averaged in the same way, and
+`rendered` with a render at the smaller size, as a protocol would that degrades test photographs
+like training photographs.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@
     xrgs-report --external gsplat:renders
 
 The steps may run on different machines. `save` writes the photographs, the cameras and the SfM
-points of a cell. `train` needs torch, numpy, Pillow and gsplat 1.5.3 alone, and a GPU. It follows
+points of a cell. `train` needs only torch, numpy, Pillow and gsplat 1.5.3, and a GPU. It follows
 gsplat's `examples/simple_trainer.py` with its default settings: same initialisation, learning
 rates, loss and order of operations, and gsplat's own `rasterization` and `DefaultStrategy`. It
 writes a render of each test view, which a report scores beside the cells of its sweep.
@@ -28,11 +28,11 @@ from torch.nn import functional
 
 
 class View(NamedTuple):
-    """A view of the folder that `save` wrote."""
+    """A view in the folder that `save` writes."""
 
     name: str
-    viewmat: Tensor  # [4, 4]
-    K: Tensor  # [3, 3]
+    viewmat: Tensor  # [4, 4] world to camera
+    K: Tensor  # [3, 3] px
     width: int
     height: int
     photograph: Tensor | None
@@ -60,7 +60,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def save(options: argparse.Namespace) -> None:
-    """Write what a cell trains and is scored on."""
+    """Write the photographs, cameras and SfM points of a cell."""
     import xrgs
 
     data = xrgs.Store(options.store).find_cell(options.cell).dataset()
@@ -111,7 +111,7 @@ def initial_splats(points: Tensor, colors: Tensor, device: str) -> torch.nn.Para
 
 
 def ssim(first: Tensor, second: Tensor) -> Tensor:
-    """Mean SSIM of two images [H, W, 3] over the windows that lie inside [wang2004]."""
+    """Return the mean SSIM of two images [H, W, 3] over the windows that lie inside [wang2004]."""
     offsets = torch.arange(11, device=first.device) - 5.0
     taps = torch.exp(-offsets.square() / (2 * 1.5**2))
     taps = (taps / taps.sum()).expand(15, 1, 11)
@@ -126,7 +126,7 @@ def ssim(first: Tensor, second: Tensor) -> Tensor:
 
 
 def render(splats: torch.nn.ParameterDict, view: View, sh_degree: int) -> tuple[Tensor, Any]:
-    """Return gsplat's render [H, W, 3] of a view, and what its strategy needs to know."""
+    """Return gsplat's render [H, W, 3] of a view, and the `info` for its strategy."""
     from gsplat import rasterization
 
     image, _, info = rasterization(
@@ -150,7 +150,7 @@ def render(splats: torch.nn.ParameterDict, view: View, sh_degree: int) -> tuple[
 def make_optimizers(
     splats: torch.nn.ParameterDict, scene_scale: float
 ) -> dict[str, torch.optim.Optimizer]:
-    """Make an Adam for each parameter, with the rates of gsplat's trainer."""
+    """Make an Adam for each parameter, with the learning rates of gsplat's trainer."""
     rates = {
         "means": 1.6e-4 * scene_scale,
         "scales": 5e-3,

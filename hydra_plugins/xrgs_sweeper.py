@@ -1,9 +1,9 @@
-"""Registers with Hydra the schema, the sweeper, the folder `sweeps/`, and missing launchers.
+"""Registers with Hydra: the schema, the sweeper, the folder `sweeps/`, and missing launchers.
 
-Hydra loads plugins from this namespace package only. It imports every plugin when it starts, so
-this file stays light: the work is done in `xrgs.sweep.study`. Hydra executes the file before adding
-it to `sys.modules`, where a dataclass looks up annotations that are strings; therefore there is no
-`from __future__ import annotations`.
+Hydra loads plugins only from this namespace package. It imports every plugin when it starts, so
+this file stays light: the work is done in `xrgs.sweep.study`. There is no `from __future__ import
+annotations`: a dataclass looks up string annotations in `sys.modules`, to which Hydra adds this
+file only after executing it.
 """
 
 from dataclasses import dataclass, field
@@ -26,12 +26,12 @@ class XrgsSweeperConf:
 
     _target_: str = "hydra_plugins.xrgs_sweeper.XrgsSweeper"
     params: dict[str, str] = field(default_factory=dict)
-    """Axes that a file of `sweeps/` sets: comma-separated values by the override's key."""
+    """Axes in a file of `sweeps/`: key of the override -> comma-separated values."""
     brief: bool = False
-    """Print only progress and failures: `xrgs-train` says the rest."""
+    """Whether to print only progress and failures; `xrgs-train` prints the rest itself."""
 
 
-#: `conf/config.yaml` is checked against it.
+#: The schema against which Hydra checks `conf/config.yaml`.
 ConfigStore.instance().store(name="xrgs_schema", node=Conf, provider="xrgs")
 ConfigStore.instance().store(
     group="hydra/sweeper", name="xrgs", node=XrgsSweeperConf, provider="xrgs"
@@ -46,8 +46,8 @@ for _extra, _launchers in _EXTRAS.items():
     if find_spec(f"hydra_plugins.hydra_{_extra}_launcher") is not None:
         continue
     for _name in _launchers:
-        # Stands in for the launcher and accepts its settings, so that the sweep can name the
-        # package to install instead of failing on an unknown key.
+        # Replaces the missing launcher and accepts its settings, so that the sweep can name the
+        # package to install, instead of failing on an unknown key.
         _node = OmegaConf.create({"install": f"xrgs[{_extra}]"}, flags={"struct": False})
         ConfigStore.instance().store(_name, _node, group="hydra/launcher", provider="xrgs")
 
@@ -75,7 +75,7 @@ class XrgsSweeper(Sweeper):
     def setup(
         self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
     ) -> None:
-        """Keep what Hydra gives a sweeper before it calls `sweep`.
+        """Store the arguments; Hydra calls this before `sweep`.
 
         Args:
             hydra_context: Hydra's context of this call.

@@ -1,9 +1,9 @@
-"""Compares what other programs read of own files of Gaussians, and what xrgs reads of theirs.
+"""Checks that other programs read our files of Gaussians as xrgs does, and that xrgs reads theirs.
 
     python benchmarks/interchange/compare.py
 
 prints the tables of docs/export.md. The programs are installed into a temporary folder, at the
-versions below, by pip and npm (with Node.js). `--folder FOLDER` keeps them, for a second time.
+versions below, by pip and npm (with Node.js). `--folder FOLDER` keeps them for the next run.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from xrgs.splat.quaternions import rotation_matrices
 from xrgs.splat.sh import C0
 
 HERE = Path(__file__).parent
-#: Version, where it is installed from, what it reads, what it writes.
+#: Program -> version, registry, formats that it reads, formats that it writes.
 PROGRAMS = {
     "splat-transform": ("3.7.0", "npm", "ply spz", "ply spz glb"),
     "@adobe/spz": ("0.2.3", "npm", "spz", ""),
@@ -45,23 +45,25 @@ PROGRAMS = {
     "trimesh": ("5.2.0", "pypi", "ply glb", ""),
     "pygltflib": ("1.16.5", "pypi", "glb", ""),
 }
+#: Program -> its name in npm, if another.
 NPM_NAMES = {"splat-transform": "@playcanvas/splat-transform"}
+#: The entries of a symmetric matrix that are compared: the upper triangle, row by row.
 UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 Arrays = dict[str, np.ndarray[Any, Any]]
 
 
 class ProgramError(Exception):
-    """A program refuses a file; the message is its last line that says why."""
+    """A program refuses a file; the message is the program's last line with an error."""
 
 
 @dataclass(frozen=True)
 class Programs:
-    """The installed programs."""
+    """The programs, installed in a folder."""
 
     folder: Path
 
     def install(self) -> None:
-        """Install what is not there yet."""
+        """Install the programs that are missing."""
         pinned: dict[str, list[str]] = {"npm": [], "pypi": []}
         for name, (version, registry, *_) in PROGRAMS.items():
             mark = "@" if registry == "npm" else "=="
@@ -83,8 +85,8 @@ class Programs:
         _run(command, self.folder)
 
     def read(self, program: str, file: Path, *more: str) -> Arrays:
-        """Return what a program reads, see `programs.py`."""
-        if program == "splat-transform":  # it has no function to call: convert, then read
+        """Return the arrays that a program reads from a file, see `programs.py`."""
+        if program == "splat-transform":  # it only converts: read its .ply
             converted = file.with_name(f"{file.name}.ply")
             self.run("write", program, file, converted)
             return self.read("plyfile", converted)
@@ -114,7 +116,11 @@ def scene() -> Gaussians:
 
 
 def arrays(gaussians: Gaussians) -> Arrays:
-    """Return Gaussians as a program would that reads all of them."""
+    """Return the arrays that a program would read without any loss.
+
+    `positions` [N, 3], `shapes` [N, 6] (upper triangle of the covariances), `opacities` [N] and
+    `colours` [N, 3] in 0..1, `harmonics` [N, 15, 3].
+    """
     axes = rotation_matrices(gaussians.quats.detach().double())
     axes = axes * gaussians.scales.detach().double().exp()[:, None]
     covariances = (axes @ axes.transpose(1, 2)).numpy()
@@ -128,23 +134,23 @@ def arrays(gaussians: Gaussians) -> Arrays:
 
 
 def comparable(read: Arrays) -> Arrays:
-    """Return what a program reads by the names of `arrays`."""
-    found = {"positions": read["means"], "opacities": read["opacities"].reshape(-1)}
-    found["colours"] = read["colors"] if "colors" in read else C0 * read["sh0"].reshape(-1, 3) + 0.5
+    """Convert the arrays of `Programs.read` to those of `arrays`."""
+    named = {"positions": read["means"], "opacities": read["opacities"].reshape(-1)}
+    named["colours"] = read["colors"] if "colors" in read else C0 * read["sh0"].reshape(-1, 3) + 0.5
     if "covariances" in read:
-        found["shapes"] = read["covariances"]
+        named["shapes"] = read["covariances"]
     elif "quats" in read:
         axes = rotation_matrices(torch.from_numpy(read["quats"])).numpy() * read["scales"][:, None]
         full = axes @ axes.swapaxes(1, 2)
-        found["shapes"] = np.stack([full[:, i, k] for i, k in UPPER], axis=1)
+        named["shapes"] = np.stack([full[:, i, k] for i, k in UPPER], axis=1)
     if "shN" in read:
-        found["harmonics"] = read["shN"]
-    return found
+        named["harmonics"] = read["shN"]
+    return named
 
 
 def differences(theirs: Arrays, ours: Arrays) -> dict[str, str]:
-    """Return how arrays differ, in words, by their names; nothing for those that agree."""
-    found = {}
+    """Return name of an array -> its difference in words, for the arrays that differ."""
+    words = {}
     for name, values in theirs.items():
         error = np.abs(values - ours[name])
         if name == "shapes":
@@ -153,18 +159,18 @@ def differences(theirs: Arrays, ours: Arrays) -> dict[str, str]:
             continue
         step = {"opacities": 1 / 255, "colours": 1 / 255, "harmonics": 1 / 128}.get(name, 0)
         if error.max() <= 1.01 * step:
-            found[name] = "8 bits"
+            words[name] = "8 bits"
         elif name == "positions" and (turn := _axes(values, ours[name])):
-            found[name] = f"are {turn}"
+            words[name] = f"are {turn}"
         else:
-            found[name] = f"up to {error.max():.1g} off"
-    return found
+            words[name] = f"up to {error.max():.1g} off"
+    return words
 
 
 def _axes(theirs: np.ndarray[Any, Any], ours: np.ndarray[Any, Any]) -> str:
-    """Return the axes of ours that x, y and z of theirs are; nothing where they are no others."""
+    """Return which of our axes their x, y and z are, such as `x -y -z`; empty if none fits."""
     turns = product(permutations(range(3)), product((1, -1), repeat=3))
-    next(turns)  # as they are
+    next(turns)  # skip the identity
     for order, signs in turns:
         if np.abs(ours[:, order] * signs - theirs).max() < 1e-3:
             return " ".join(
@@ -174,26 +180,26 @@ def _axes(theirs: np.ndarray[Any, Any], ours: np.ndarray[Any, Any]) -> str:
 
 
 def psnr(theirs: Arrays, ours: Arrays) -> float:
-    """Return the PSNR, dB, of a render of theirs against ours, which has what theirs lacks."""
-    renders = [_render({**ours, **of}) for of in (theirs, ours)]
+    """Return the PSNR, dB, of a render of their arrays against ours; missing arrays are ours."""
+    renders = [_render({**ours, **read}) for read in (theirs, ours)]
     error = (renders[0] - renders[1]).clamp(-1, 1).square().mean().item()
     return -10 * math.log10(max(error, 1e-12))
 
 
-def _render(of: Arrays) -> torch.Tensor:
-    full = np.zeros((len(of["shapes"]), 3, 3))
+def _render(gaussians: Arrays) -> torch.Tensor:
+    full = np.zeros((len(gaussians["shapes"]), 3, 3))
     for at, (i, k) in enumerate(UPPER):
-        full[:, i, k] = full[:, k, i] = of["shapes"][:, at]
+        full[:, i, k] = full[:, k, i] = gaussians["shapes"][:, at]
     variances, axes = np.linalg.eigh(full)
     axes[:, :, 0] *= np.linalg.det(axes)[:, None]
     quats = np.roll(Rotation.from_matrix(axes).as_quat(), 1, axis=1)
-    sh0 = (of["colours"][:, None] - 0.5) / C0
+    sh0 = (gaussians["colours"][:, None] - 0.5) / C0
     values = (
-        of["positions"],
+        gaussians["positions"],
         quats,
         np.sqrt(variances.clip(1e-12)),
-        of["opacities"],
-        np.concatenate([sh0, of["harmonics"]], axis=1),
+        gaussians["opacities"],
+        np.concatenate([sh0, gaussians["harmonics"]], axis=1),
     )
     K = torch.tensor([[[100.0, 0, 64], [0, 100, 64], [0, 0, 1]]])
     parts = (torch.from_numpy(value.copy()).float() for value in values)
@@ -204,21 +210,21 @@ def _render(of: Arrays) -> torch.Tensor:
 
 
 def as_ply(read: Arrays, suffix: str) -> Arrays:
-    """Turn what a program reads of a .glb back to the axes of .ply files: half a turn about z."""
+    """Turn the arrays read from a .glb to the axes of .ply files: half a turn about z."""
     if suffix != ".glb":
         return read
     turned = dict(read)
     turned["positions"] = read["positions"] * [-1, -1, 1]
     if "shapes" in read:
         turned["shapes"] = read["shapes"] * [1, 1, -1, 1, -1, 1]
-    if "harmonics" in read:  # those of odd m change their sign
+    if "harmonics" in read:  # harmonics of odd order m change sign
         odd = [abs(m) % 2 for band in (1, 2, 3) for m in range(-band, band + 1)]
         turned["harmonics"] = read["harmonics"] * (1 - 2 * np.array(odd))[:, None]
     return turned
 
 
 def reading(programs: Programs, folder: Path) -> Iterator[tuple[str, ...]]:
-    """Write own files and yield a row for each program that reads one."""
+    """Write our files, and yield a table row for each program and format that it reads."""
     gaussians = scene()
     files = {form: folder / f"own.{form}" for form in ("ply", "spz", "glb")}
     for file in files.values():
@@ -241,13 +247,13 @@ def _row(programs: Programs, program: str, file: Path) -> tuple[str, str, str]:
         return versions, f"refuses version 3: {error}", "-"
     ours = arrays(xrgs.load_gaussians(file).gaussians)
     missing = [name for name in ours if name not in theirs]
-    what = "all" if not missing else f"no {', no '.join(missing)}"
-    return ", ".join(filter(None, [versions, what])), _told(theirs, ours), _decibels(theirs, ours)
+    scope = "all" if not missing else f"no {', no '.join(missing)}"
+    return ", ".join(filter(None, [versions, scope])), _words(theirs, ours), _decibels(theirs, ours)
 
 
-def _told(theirs: Arrays, ours: Arrays) -> str:
-    told = [f"{name}: {how}" for name, how in differences(theirs, ours).items()]
-    return "; ".join(told) or "nothing"
+def _words(theirs: Arrays, ours: Arrays) -> str:
+    texts = [f"{name}: {how}" for name, how in differences(theirs, ours).items()]
+    return "; ".join(texts) or "nothing"
 
 
 def _decibels(theirs: Arrays, ours: Arrays) -> str:
@@ -256,15 +262,15 @@ def _decibels(theirs: Arrays, ours: Arrays) -> str:
 
 
 def _reads(programs: Programs, program: str, file: Path, version: str) -> bool:
-    of_version = file if version == "3" else file.with_name(f"own.{version}.spz")
+    versioned = file if version == "3" else file.with_name(f"own.{version}.spz")
     try:
-        return len(programs.read(program, of_version)["means"]) > 0
+        return len(programs.read(program, versioned)["means"]) > 0
     except ProgramError:
         return False
 
 
 def writing(programs: Programs, folder: Path) -> Iterator[tuple[str, ...]]:
-    """Yield a row for each program that converts an own .ply to a file, which xrgs reads."""
+    """Let programs convert our .ply; yield a table row on how xrgs reads each of their files."""
     gaussians = scene()
     source = folder / "own.ply"
     xrgs.save_gaussians(source, gaussians)
@@ -279,11 +285,11 @@ def writing(programs: Programs, folder: Path) -> Iterator[tuple[str, ...]]:
                 yield label, f".{form}", str(error), "-"
                 continue
             ours = arrays(gaussians)
-            yield label, f".{form}", _told(read, ours), _decibels(read, ours)
+            yield label, f".{form}", _words(read, ours), _decibels(read, ours)
 
 
 def tables(folder: Path) -> str:
-    """Return both tables in Markdown; `folder` has, or gets, the programs."""
+    """Return both tables in Markdown; missing programs are installed in `folder`."""
     programs = Programs(folder.absolute())
     programs.install()
     read = ("program", "own file", "it reads", "what differs from xrgs's reading", "PSNR, dB")

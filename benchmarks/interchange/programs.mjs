@@ -1,5 +1,5 @@
-// As programs.py, with a program of npm: `node programs.mjs read|write PROGRAM FILE OUT`, run in the
-// folder that has its node_modules. @adobe/spz reads to axes that a last word names, such as RDF.
+// As programs.py, for programs of npm: `node programs.mjs read|write PROGRAM FILE OUT`, run in the
+// folder with node_modules. For @adobe/spz a last word names the axes to read to, such as RDF.
 import { execFileSync } from "node:child_process";
 import { readFileSync, writeFileSync } from "node:fs";
 import { basename, extname, resolve } from "node:path";
@@ -15,7 +15,7 @@ const buffer = (file) => {
   return content.buffer.slice(content.byteOffset, content.byteOffset + content.byteLength);
 };
 
-/** A GaussianCloud of Niantic's library or of spz-js: logits, logarithms, quaternions xyzw. */
+/** Converts a GaussianCloud of Niantic's library or spz-js: logits, log scales, quaternions xyzw. */
 function cloud(data) {
   if (!data.numPoints) throw new Error("reads no Gaussians");
   return {
@@ -28,7 +28,7 @@ function cloud(data) {
   };
 }
 
-/** A geometry of three's GaussianSplat: covariances, colours of 8 bits, harmonics of 8 bits. */
+/** Converts a geometry of three's GaussianSplat: covariances, 8-bit colours, 8-bit harmonics. */
 function geometry(object, matrix) {
   const count = object.getAttribute("position").count;
   const color = object.getAttribute("color").array;
@@ -85,7 +85,7 @@ const readers = {
   },
 };
 
-/** Convert a .ply; with @adobe/spz, a .spz to the version that the name ends with, as in `a.2.spz`. */
+/** Converts a .ply; with @adobe/spz, a .spz to the version in the name of `out`, as in `a.2.spz`. */
 async function write(program, file, out) {
   if (program === "@adobe/spz") {
     const spz = await adobe();

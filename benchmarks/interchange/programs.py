@@ -1,9 +1,9 @@
 """Reads or writes a file of Gaussians with a program of PyPI, in an environment without xrgs.
 
-`python programs.py read PROGRAM FILE OUT.json` writes what the program reads, in arrays of N rows:
-`means`, `covariances` [6] or `quats` (wxyz) and `scales`, `opacities` (0..1), `sh0` or `colors`
-(0..1), `shN` [K - 1, 3]. What the program does not offer is left out. `python programs.py write
-PROGRAM FILE OUT` converts a .ply.
+`python programs.py read PROGRAM FILE OUT.json` writes the Gaussians that the program reads, as
+arrays of N rows: `means`, `covariances` [6] or `quats` (wxyz) and `scales`, `opacities` (0..1),
+`sh0` or `colors` (0..1), `shN` [K - 1, 3]. Arrays that the program does not offer are left out.
+`python programs.py write PROGRAM FILE OUT` converts a .ply.
 """
 
 from __future__ import annotations
@@ -77,10 +77,10 @@ def _aura_splat(file: Path) -> dict[str, Any]:
 
     samples = load_3dgs_ply(file)
     return {
-        "means": [of.mean for of in samples],
-        "covariances": [[of.covariance[i][k] for i, k in UPPER] for of in samples],
-        "opacities": [of.opacity for of in samples],
-        "colors": [of.color for of in samples],
+        "means": [sample.mean for sample in samples],
+        "covariances": [[sample.covariance[i][k] for i, k in UPPER] for sample in samples],
+        "opacities": [sample.opacity for sample in samples],
+        "colors": [sample.color for sample in samples],
     }
 
 
@@ -91,7 +91,7 @@ def _fourdgs(file: Path) -> dict[str, Any]:
     if file.suffix == ".glb":
         data = gltf.from_gltf(str(file)).gaussians
     else:
-        with tempfile.TemporaryDirectory() as folder:  # it takes a sequence of .ply files
+        with tempfile.TemporaryDirectory() as folder:  # fourdgs reads a sequence of .ply files
             shutil.copy(file, folder)
             data, _ = convert.convert_ply_sequence(folder)
     sh = data.sh / 255.0 * (SH_QUANT_HI - SH_QUANT_LO) + SH_QUANT_LO
@@ -106,7 +106,7 @@ def _fourdgs(file: Path) -> dict[str, Any]:
 
 
 def _table(vertices: Any) -> dict[str, Any]:
-    """Return the parameters of the vertices of a .ply, in 3DGS's layout."""
+    """Convert the vertices of a .ply in 3DGS's layout."""
 
     def columns(*names: str) -> Any:
         return np.stack([vertices[name] for name in names], axis=1)
@@ -156,7 +156,7 @@ def _pygltflib(file: Path) -> dict[str, Any]:
 
     prefix = "KHR_gaussian_splatting:"
     bands = [
-        f"{prefix}SH_DEGREE_{band}_COEF_{of}" for band in (1, 2, 3) for of in range(2 * band + 1)
+        f"{prefix}SH_DEGREE_{band}_COEF_{n}" for band in (1, 2, 3) for n in range(2 * band + 1)
     ]
     return {
         "means": values("POSITION"),
@@ -180,7 +180,7 @@ READERS = {
 
 
 def write(program: str, file: Path, out: Path) -> None:
-    """Convert a .ply as a program does."""
+    """Let a program convert a .ply."""
     if program == "gaussforge":
         from gaussforge import GaussForge
 
@@ -210,14 +210,14 @@ def write(program: str, file: Path, out: Path) -> None:
 
 
 def main() -> None:
-    """Read or write, as the command line says."""
+    """Run `read` or `write` of the command line."""
     action, program, file, out = sys.argv[1], sys.argv[2], Path(sys.argv[3]), Path(sys.argv[4])
     if action == "write":
         write(program, file, out)
         return
     read = READERS[program](file)
     out.write_text(
-        json.dumps({name: np.asarray(of, np.float64).tolist() for name, of in read.items()})
+        json.dumps({name: np.asarray(array, np.float64).tolist() for name, array in read.items()})
     )
 
 

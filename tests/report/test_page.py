@@ -411,8 +411,8 @@ def test_stale_scores_are_said_once_with_what_computes_them(made: Any) -> None:
     made.write()
     report = build(made.store.path, pictures=[])
     warning = (
-        "The scores of 2 cells are missing or of other code than is installed (LPIPS, SSIM):"
-        " xrgs-store rescore computes them."
+        "Scores of 2 cells are missing, or other code than the installed has computed them"
+        " (LPIPS, SSIM): xrgs-store rescore computes them."
     )
     assert report.text.count(warning) == 1
     assert (report.folder / "table.md").read_text().count(warning) == 1
@@ -425,7 +425,7 @@ def test_stale_scores_are_said_once_with_what_computes_them(made: Any) -> None:
 def test_a_new_protocol_makes_every_score_stale(made: Any) -> None:
     made.add(scored_by={"protocol": "old"})
     made.write()
-    said = "The scores of 1 cell are missing or of other code than is installed (LPIPS, SSIM, PSNR)"
+    said = "or other code than the installed has computed them (LPIPS, SSIM, PSNR)"
     assert said in build(made.store.path, pictures=[]).text
 
 

@@ -51,7 +51,7 @@ def test_a_variant_without_a_report_leaves_a_report_that_says_so(
         made.add(label, variant="v")
     made.write()
     report = build(made.store.path, pictures=[])
-    said = "not known, what became of them: "
+    said = "unknown what was done with them: "
     assert said in (report.folder / "report.html").read_text()
     assert said in (text := (report.folder / "table.md").read_text())
     assert str(made.store.path) not in text

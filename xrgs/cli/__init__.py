@@ -1,1 +1,1 @@
-"""The commands, one file each, with the schema of a command's arguments beside it."""
+"""The commands, one file each, with their arguments."""

@@ -11,7 +11,7 @@ def bench(settings: Settings) -> None:
     """Measure the run time of rendering and training on random loads, and its numerical error.
 
     Args:
-        settings: What is measured, and where the results are written.
+        settings: The loads and methods, and the files of the results.
     """
     from xrgs.bench.run import run
 

@@ -1,25 +1,25 @@
-"""Chooses the size and the steps of a training for a time, from how quickly this machine trains."""
+"""Chooses size and steps of a training for a given time, from this machine's measured speed."""
 
 from __future__ import annotations
 
-#: Sizes of the views that are chosen from, px along the longer side, and the fewest steps that are
-#: worth it at 504 px, where they are `preset=laptop`'s; at other sizes as many for each pixel.
+#: The longer sides of views to choose from, px. A size is worth it from 3,000 steps on at 504 px
+#: (`preset=laptop`); at other sizes in proportion to the number of pixels.
 _SIZES, _AT, _STEPS = (252, 378, 504, 756, 1008), 504, 3000
-#: The fewest steps, whatever the time, and the most: those of the paper.
+#: The fewest steps, whatever the time, and the most, those of the paper.
 _LEAST, _MOST = 200, 30_000
-#: Height over width, and rendered pixels and Gaussians for each pixel, before views are known.
+#: Guesses for unknown views: height over width, and rendered pixels plus Gaussians for each pixel.
 _ASPECT, _UNITS_OF_A_PIXEL = 0.7, 1.5
-#: Shares of the time: for training, where it is not known yet how long the cameras take; and of
-#: what is left then, beside the scores and the page, which take so many seconds.
+#: The share of the whole time for training, before the time for the cameras is known; the share of
+#: the remaining time afterwards; and the seconds for scores and page.
 _TRAINING, _OF_THE_REST, _ENDING_S = 0.6, 0.95, 15.0
 
 
 def size_for(seconds: float, unit: float) -> int:
-    """Return the longest side of the views, px, for a time that includes finding the cameras.
+    """Return the longer side of the views, px, for a time that includes finding the cameras.
 
     Args:
-        seconds: The time.
-        unit: Seconds a step for each rendered pixel and each Gaussian.
+        seconds: The time of the whole command, s.
+        unit: Seconds per step for each rendered pixel and each Gaussian.
     """
     fitting = [
         size
@@ -30,13 +30,13 @@ def size_for(seconds: float, unit: float) -> int:
     return max(fitting, default=_SIZES[0])
 
 
-def steps_for(seconds: float, of_a_step: float) -> int:
-    """Return how many steps fit into what is left of the time, to two digits.
+def steps_for(seconds: float, step_s: float) -> int:
+    """Return how many steps fit into the remaining time, to two digits.
 
     Args:
-        seconds: The time that is left to the end of the command.
-        of_a_step: Seconds of a step.
+        seconds: The remaining time of the command, s.
+        step_s: Seconds per step.
     """
-    count = int((_OF_THE_REST * seconds - _ENDING_S) / of_a_step)
+    count = int((_OF_THE_REST * seconds - _ENDING_S) / step_s)
     digits: int = 10 ** max(0, len(str(max(count, 0))) - 2)
     return min(_MOST, max(_LEAST, count // digits * digits))

@@ -42,33 +42,33 @@ def download(
     max_bytes: Annotated[int | None, shown_as("N")] = None,
     redirect_hosts: Annotated[list[str] | None, shown_as("HOST ...")] = None,
 ) -> None:
-    """Download published scenes and unpack them. Run again, it continues.
+    """Download published scenes and unpack them; run it again to continue an interrupted download.
 
     Args:
         dataset: The set of scenes.
-        scenes: Names of its scenes; all by default.
+        scenes: Names of scenes in the set; all by default.
         data_root: The folder to unpack into; by default `data_root` of the config.
-        url: The address of the archive, in place of the known one.
-        sha256: The hash of the archive, in place of the known one.
-        max_bytes: The largest size that is downloaded, in place of the known one.
+        url: The address of the archive, instead of the one in the config.
+        sha256: The hash of the archive, instead of the one in the config.
+        max_bytes: The largest size to download, instead of the one in the config.
         redirect_hosts: Hosts to which the address may redirect; no others are followed.
     """
     from omegaconf import OmegaConf
 
     from xrgs.photos.download.scenes import DatasetConf, fetch_scenes
 
-    known: Any = OmegaConf.to_container(
+    published: Any = OmegaConf.to_container(
         OmegaConf.load(config.CONF_DIR / "data" / f"{dataset}.yaml")
     )
-    given = {
+    arguments = {
         "url": url,
         "sha256": sha256,
         "max_bytes": max_bytes,
         "redirect_hosts": redirect_hosts,
     }
-    changes: Any = {key: value for key, value in given.items() if value is not None}
+    changes: Any = {key: value for key, value in arguments.items() if value is not None}
     root = data_root or Path(OmegaConf.load(config.CONF_DIR / "config.yaml").data_root)
-    say(fetch_scenes(replace(DatasetConf(**known), **changes), scenes, root))
+    say(fetch_scenes(replace(DatasetConf(**published), **changes), scenes, root))
 
 
 def lpips(
@@ -78,8 +78,8 @@ def lpips(
     """Download the weights of LPIPS; without them its rows in tables are n/a.
 
     Args:
-        source: The archive or the weights, as a file or at another address.
-        network: `alex`, which every evaluation has, or `vgg`, for `xrgs-store rescore --also
+        source: The archive or the weights: a file, or another address.
+        network: `alex`, used in every evaluation, or `vgg`, for `xrgs-store rescore --also
             lpips_vgg`.
     """
     from xrgs.evaluation.lpips.download import fetch_vgg, fetch_weights
@@ -94,10 +94,9 @@ def inspect(
     """Print a table of a variant's views and the result of SfM, and draw all views on one sheet.
 
     Args:
-        variant: A folder of photographs, as they are; overrides may follow. Or what the variant is
-            made of, by overrides of Hydra as xrgs-sweep takes them: scene=llff/fern
-            variant.factor=4. A variant that the store lacks is built. Or the variant's folder or
-            its id, or a cell of it.
+        variant: A folder of photographs, which are not degraded; overrides may follow. Or overrides
+            as for xrgs-sweep, such as scene=llff/fern variant.factor=4. In both cases a variant
+            that the store lacks is built. Or a variant by its folder or id, or a cell of it.
         out: The file of the sheet; by default it is named after the variant.
     """
     from xrgs.store.inspect import describe
@@ -108,7 +107,7 @@ def inspect(
 
 
 def _variant(words: Sequence[str]) -> Path:
-    """Return the folder of the variant that the words of `inspect` name; it is built if need be."""
+    """Return the folder of the variant that `inspect` shows; build the variant if it is missing."""
     from xrgs import composing
     from xrgs.cli.overrides import explained, with_quotes
     from xrgs.sweep import build_variants
@@ -144,47 +143,46 @@ def export(
 
     Args:
         name: A cell or a variant: its id in the store or the beginning of the id, its folder, or
-            the name of a scene with one done cell. A .ply, .glb or .spz file is converted to
-            another of these.
-        layout: `ply`, `glb` (glTF with KHR_gaussian_splatting) and `spz` (8 bits a value): one file
-            of Gaussians. `colmap` and `nerfstudio`: a folder of images, cameras, points and split,
-            and the splats of a cell. `auto`: by the end of --out, where a folder is COLMAP's.
-        out: The file to write, which is replaced, or a new folder; by default it is named after
-            what is exported.
+            the name of a scene with one done cell. Or a .ply, .glb or .spz file to convert.
+        layout: `ply`, `glb` (glTF with KHR_gaussian_splatting) and `spz` (8 bits per value): one
+            file of Gaussians. `colmap` and `nerfstudio`: a folder with images, cameras, points and
+            split, and the splats of a cell. `auto`: by the suffix of --out; a folder gets `colmap`.
+        out: The file to write, which is replaced, or a new folder; by default named after the cell,
+            variant or file.
         store: The store.
     """
     path = user_path(name)
     is_other_path = path.name != name and not path.is_dir()
     if path.suffix.lower()[1:] not in SPLAT_FORMATS and not is_other_path:
-        there = Store(store)
-        path = path if path.is_dir() and not there.exists else there.find_folder(name)
+        home = Store(store)
+        path = path if path.is_dir() and not home.exists else home.find_folder(name)
     say(write_export(path, out, layout))
 
 
 def form_of(out: Path) -> str:
-    """Return the format of an export, by the end of the name that it is written to.
+    """Return the format of an export by the suffix of its file; `colmap` for a folder.
 
     Raises:
-        XrgsError: The end is of no format.
+        XrgsError: The suffix is of no format.
     """
     if (form := out.suffix.lower()[1:]) in SPLAT_FORMATS:
         return form
     if out.suffix:
-        known = ", ".join(f".{form}" for form in SPLAT_FORMATS)
-        raise XrgsError(f"out={out}: a file ends with {known}; a folder has no suffix")
+        suffixes = ", ".join(f".{form}" for form in SPLAT_FORMATS)
+        raise XrgsError(f"out={out}: a file ends with {suffixes}; a folder has no suffix")
     return "colmap"
 
 
 def write_export(path: Path, out: Path | None, layout: str = "auto") -> str:
-    """Write an export, and return a line on it.
+    """Write an export, and return a line for the terminal.
 
     Args:
         path: The folder of a cell or a variant, or a file of Gaussians.
         out: The file or the folder to write; None names it after `path`.
-        layout: The format; `auto` takes the one of `out`.
+        layout: The format; `auto` takes `form_of(out)`.
 
     Raises:
-        XrgsError: The cell can't be exported so, or `out` can't be written.
+        XrgsError: The export is not possible in this format, or `out` can't be written.
     """
     from xrgs.store.export import export as write
     from xrgs.store.export import export_splats

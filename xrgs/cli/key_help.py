@@ -1,4 +1,4 @@
-"""`xrgs-sweep help=KEY`: explains keys by the comments of `conf/config.yaml`."""
+"""`xrgs-sweep help=KEY`: explains a key by its comment in `conf/config.yaml`."""
 
 from __future__ import annotations
 
@@ -21,38 +21,38 @@ class Entry(NamedTuple):
     """A key of `conf/config.yaml`."""
 
     value: str
-    """Its value in the baseline, as it is written there; empty for a group of keys."""
+    """The value in the baseline, as written; empty for a group of keys."""
     comment: tuple[str, ...]
-    """The lines of the comments above it and behind it."""
+    """The lines of the comments above and behind the key."""
 
 
 def explain(key: str) -> str:
-    """Return a key's value in the baseline and its comment; of a group also those of its keys.
+    """Return a key's value in the baseline and its comment; for a group, also those of its keys.
 
     Args:
-        key: A key as it stands before `=` on the command line, as `train.steps` or `train`.
+        key: A key or a group, as `train.steps` or `train`.
 
     Raises:
         XrgsError: There is no such key; the message offers similar ones.
     """
-    known = entries()
-    found = [
+    keys = entries()
+    lines = [
         "\n  ".join([f"{name}={entry.value}" if entry.value else name, *entry.comment])
-        for name, entry in known.items()
+        for name, entry in keys.items()
         if f"{name}.".startswith(f"{key}.")
     ]
-    if not found:
-        raise XrgsError(f"help={key}: there is no such key{did_you_mean(key, known)}")
-    return "\n\n".join([*found, _WHERE])
+    if not lines:
+        raise XrgsError(f"help={key}: there is no such key{did_you_mean(key, keys)}")
+    return "\n\n".join([*lines, _WHERE])
 
 
 def entries() -> dict[str, Entry]:
-    """Return what `conf/config.yaml` says of each key and each group of keys, in its order.
+    """Read the entries of `conf/config.yaml`, keys and groups of keys, in its order.
 
-    Of YAML only what the file uses is read: a key with its value on one line, and two more spaces
-    before each key of a group.
+    Only the YAML of this file is understood: a key with its value on one line, and two more spaces
+    of indent for the keys of a group.
     """
-    known: dict[str, Entry] = {}
+    result: dict[str, Entry] = {}
     path: list[str] = []
     above: list[str] = []
     content = read_file(config.CONF_DIR / "config.yaml").decode()
@@ -64,6 +64,6 @@ def entries() -> dict[str, Entry]:
             indent, name, value, behind = entry.groups()
             path = [*path[: len(indent) // 2], name]
             key = ".".join(path)
-            known[key] = Entry(value.strip(), (*above, *([behind] if behind else [])))
+            result[key] = Entry(value.strip(), (*above, *([behind] if behind else [])))
         above = []
-    return known
+    return result

@@ -1,4 +1,4 @@
-"""What all commands but `xrgs-sweep` share: their options, by tyro, and errors as messages.
+"""Options of all commands except `xrgs-sweep`, by tyro, and errors as messages.
 
 tyro makes help, completion and messages about wrong usage from typed functions and their
 docstrings. `xrgs-sweep` takes Hydra's overrides instead, see `overrides`.
@@ -34,7 +34,7 @@ STORE = DEFAULT_STORE
 
 
 def shown_as(metavar: str) -> object:
-    """Describe an option: what the help calls its value; the help leaves its default out."""
+    """Annotate an option: the help shows `metavar` for its value, and no default."""
     return arg(metavar=metavar, help_behavior_hint="")
 
 
@@ -55,7 +55,7 @@ _REGISTRY = ConstructorRegistry()
 
 @_REGISTRY.primitive_rule
 def _path(kind: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Path] | None:
-    """Read a path with `~` for the home folder, which shells leave as it is in `--out=~/a`."""
+    """Read a path, and expand `~`, which shells don't expand in `--out=~/a`."""
     if kind.type is not Path:
         return None
     return PrimitiveConstructorSpec(
@@ -74,15 +74,15 @@ def run(
     default: str = "",
     overrides: str = "",
 ) -> None:
-    """Parse the command line, and call the function that it asks for.
+    """Parse the command line, and call the function of the command or subcommand.
 
     Args:
         command: Name of the command.
         target: A function, whose typed parameters are the options and whose docstring is the help;
-            or one for each subcommand.
-        description: What the help of a command with subcommands says first.
-        default: The subcommand that is meant where none is named.
-        overrides: The subcommand that takes Hydra's overrides, `KEY=VALUE`; or `command`, where
+            or subcommand -> such a function.
+        description: The first lines of the help, for a command with subcommands.
+        default: The subcommand if the command line names none.
+        overrides: The subcommand that takes Hydra's overrides, `KEY=VALUE`; `command` itself if
             there are no subcommands.
 
     Raises:
@@ -91,12 +91,12 @@ def run(
     guard_streams()
     answer_version(command)
     functions = {command: target} if callable(target) else target
-    known = frozenset(name for function in functions.values() for name in _names(function))
+    names = frozenset(name for function in functions.values() for name in _names(function))
     name = "[a-z][a-z_]*"
     if overrides in {command, *sys.argv[1:2]}:
         name = "|".join({*_names(functions[overrides])} - {*known_keys()})
     assignment = re.compile(f"({name})=(.*)", re.DOTALL)
-    words = _with_options(sys.argv[1:], assignment, known)
+    words = _with_options(sys.argv[1:], assignment, names)
     with errors_as_messages(command, assignment):
         if callable(target):
             tyro.cli(
@@ -112,13 +112,13 @@ def run(
 
 
 def _unwrapped(function: Callable[..., None]) -> Callable[..., None]:
-    """Join the lines of each entry under Args, whose line breaks tyro would keep in the help."""
+    """Join the lines of each entry under Args: tyro would keep their line breaks in the help."""
     function.__doc__ = re.sub(r"\n {8,}", " ", inspect.cleandoc(function.__doc__ or ""))
     return function
 
 
 def _names(options: Any) -> Iterator[str]:
-    """Yield the names of a function's options, or of a dataclass, with those of its dataclasses."""
+    """Yield the names of the options of a function or dataclass, including nested dataclasses."""
     for name, hint in get_type_hints(options, include_extras=True).items():
         if is_dataclass(hint):
             yield from _names(hint)
@@ -127,21 +127,21 @@ def _names(options: Any) -> Iterator[str]:
 
 
 def _with_options(
-    words: Sequence[str], assignment: re.Pattern[str], known: Container[str]
+    words: Sequence[str], assignment: re.Pattern[str], names: Container[str]
 ) -> list[str]:
-    """Return a command line with each `KEY=VALUE`, as `xrgs-sweep` takes it, as an option.
+    """Convert each `KEY=VALUE` of a command line, as for `xrgs-sweep`, to the option `--key VALUE`.
 
-    `true` sets a flag. Commas separate values, unless there is a file of that name. Behind an
-    option, a word whose key is not known is a value, as the name of the scene `a=b`.
+    `true` sets a flag. Commas separate values, unless a file has that name. After an option, a word
+    with an unknown key is a value, such as the scene name `a=b`.
     """
-    others, options = [], []  # options come last: one of several values ends where another begins
+    others, options = [], []  # options come last: only another option ends a list of values
     for number, word in enumerate(words):
-        found = assignment.fullmatch(word)
-        is_value = found and found[1] not in known and any(w[:2] == "--" for w in words[:number])
-        if not found or is_value:
+        match = assignment.fullmatch(word)
+        is_value = match and match[1] not in names and any(w[:2] == "--" for w in words[:number])
+        if not match or is_value:
             others.append(word)
             continue
-        option, value = _option(found[1]), found[2]
+        option, value = _option(match[1]), match[2]
         if value == "true":
             options.append(option)
         elif value != "false":
@@ -160,19 +160,19 @@ def errors_as_messages(command: str, argument: re.Pattern[str] | None = None) ->
 
     Args:
         command: Name of the command, which begins the message.
-        argument: Finds the name and the rest of a message about a function's argument, as
-            `out=FOLDER: it exists`. It is printed as one about the option: `--out FOLDER: ...`.
+        argument: Splits a message on a function's argument, such as `out=FOLDER: it exists`, into
+            name and rest. It is printed with the option's name: `--out FOLDER: it exists`.
 
     Raises:
-        SystemExit: With the message, in place of the error.
+        SystemExit: With the message, instead of the error.
     """
     try:
         _check_current_folder()
         yield
     except XrgsError as error:
         message = str(error)
-        if argument and (found := argument.fullmatch(message)):
-            message = f"{_option(found[1])} {found[2]}"
+        if argument and (match := argument.fullmatch(message)):
+            message = f"{_option(match[1])} {match[2]}"
         sys.exit(for_line(f"{command}: {message}"))
 
 
@@ -184,7 +184,7 @@ def _check_current_folder() -> None:
 
 
 def answer_version(command: str) -> None:
-    """Print the version of xrgs and end the command, where `--version` is asked for.
+    """Print the version of xrgs and end the command, if the command line has `--version`.
 
     Raises:
         SystemExit: With code 0, after the version was printed.

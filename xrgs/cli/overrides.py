@@ -1,4 +1,4 @@
-"""Hydra's overrides on a command line: paths with any character, and messages about wrong ones."""
+"""Hydra's overrides on a command line: quotes for paths, and one-line messages for mistakes."""
 
 from __future__ import annotations
 
@@ -28,28 +28,28 @@ if TYPE_CHECKING:
 
     from hydra.core.override_parser.types import Override
 
-#: How Hydra says that a file of the config can't be merged into the others.
+#: Hydra's message if a file of the config can't be merged into the others.
 _IN_FILE = re.compile(r"In '([^']+)': \w+ raised while composing config:\n")
-#: How Hydra says that a key of an override is unknown.
+#: Hydra's message for an unknown key of an override.
 _NOT_OVERRIDDEN = re.compile(r"Could not override '([^']+)'")
-#: A text in quotes, and such a text where it is a whole value of a list.
+#: A quoted text, and a quoted text that is a whole item of a list.
 _IN_QUOTES = r"""(['"])(?:\\.|(?!\1).)*\1"""
 _QUOTED, _QUOTED_PART = (
     re.compile(_IN_QUOTES),
     re.compile(rf"(?:^|(?<=[\[,]))\s*{_IN_QUOTES}(?=\s*(?:[\],]|$))"),
 )
-#: By how much a bracket changes the depth of what is behind it.
+#: Bracket -> the change of the nesting depth after it.
 _DEPTH = dict.fromkeys("([{", 1) | dict.fromkeys(")]}", -1)
 _CLOSES = {"(": ")", "[": "]", "{": "}"}
-#: A comma at an end of a list, or behind another one.
+#: Commas without a value on one side: at an end of a list, or after another comma.
 _LONE_COMMA = re.compile(r"^[\s,]+|(?<=[(\[{,])[\s,]+|[\s,]+(?=[)\]}]|$)")
-#: How Hydra says that a function of an override fails.
+#: Hydra's message if a function in an override fails.
 _CALL = re.compile(
     r"(?P<kind>\w+) while evaluating '(?P<call>(?P<name>\w+)\((?P<inside>.*?)\))': (?P<reason>.*)"
 )
-#: The key or the resolver of an interpolation.
+#: The key or the resolver of an interpolation `${...}`.
 _INTERPOLATED = re.compile(r"\$\{([^:}]*)")
-#: Options of Hydra; those of the second set have a value.
+#: Options of Hydra; those in the second set take a value.
 _HYDRA_OPTIONS = frozenset(
     {"-h", "--help", "--hydra-help", "--version", "--resolve", "--run", "-r", "--multirun", "-m"}
     | {"--shell-completion", "-sc"}
@@ -58,18 +58,18 @@ _HYDRA_VALUES = frozenset(
     {"--cfg", "-c", "--package", "-p", "--config-path", "-cp", "--config-name", "-cn"}
     | {"--config-dir", "-cd", "--experimental-rerun", "--info", "-i"}
 )
-#: Keys that are switched on by `true`.
+#: Keys with the values `true` and `false`.
 _FLAGS = frozenset({"dry_run", "fail_fast"})
 #: The most names that a message lists.
 _MAX_LISTED = 20
-#: A number that is whole, and not written so: 3e3, 100.0.
+#: Numbers that may be whole, also as 3e3 or 100.0.
 _WHOLE = re.compile(r"\d+(?:\.\d*)?(?:[eE]\+?\d+)?|\d+\.0*")
 #: Keys whose values are lists of names.
 _NAMES = frozenset({"variant.test"})
-#: Those whose value is a folder, and the one that needs no value.
+#: Options of Hydra whose value is a folder, and the option whose value may be left out.
 _FOLDERS = frozenset({"--config-dir", "-cd", "--config-path", "-cp"})
 _INFO = frozenset({"--info", "-i"})
-#: What asks Hydra for something else than a sweep.
+#: Options and keys that make Hydra do something else than a sweep.
 _OTHER_MODES = frozenset(
     (
         *_INFO,
@@ -87,13 +87,13 @@ _OTHER_MODES = frozenset(
 
 @contextmanager
 def explained(hint: str = "") -> Iterator[None]:
-    """Raise errors of Hydra and OmegaConf as one-line errors that say what was meant.
+    """Turn errors of Hydra and OmegaConf into one-line errors that propose a correction.
 
     Args:
-        hint: Added to the message.
+        hint: A text to append to the message.
 
     Raises:
-        XrgsError: In place of the error.
+        XrgsError: Instead of the error.
     """
     try:
         yield
@@ -104,34 +104,34 @@ def explained(hint: str = "") -> Iterator[None]:
 
 
 def _explained(error: Exception) -> str:
-    """Return what an error of Hydra or OmegaConf says, with names like one that does not exist.
+    """Return the message of an error of Hydra or OmegaConf, with names similar to an unknown one.
 
-    Hydra's own advice is left out: `steps=100` would be told to become `+steps=100`, which adds a
-    key that nothing reads.
+    Hydra's own advice is left out: for `steps=100` it proposes `+steps=100`, which adds a key that
+    nothing reads.
     """
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         return _missing_file(error.missing_cfg_file, error.options or ())
     if isinstance(error, OverrideParseException):
         return _malformed(str(error.override), str(error))
-    if found := _IN_FILE.match(str(error)):
-        return _wrong_file(found[1], error.__context__ or error)
-    if found := _NOT_OVERRIDDEN.search(str(error)):
-        key = found[1].partition("@")[0]
+    if match := _IN_FILE.match(str(error)):
+        return _wrong_file(match[1], error.__context__ or error)
+    if match := _NOT_OVERRIDDEN.search(str(error)):
+        key = match[1].partition("@")[0]
         return f"{key}: there is no such key{did_you_mean(key, config.known_keys())}"
     offered = ""
     if isinstance(error, (ConfigKeyError, ConfigAttributeError)):
         parent = error.parent_node
-        known = tuple(map(str, parent)) if isinstance(parent, DictConfig) else ()
-        offered = did_you_mean(str(error.key), known)
+        choices = tuple(map(str, parent)) if isinstance(parent, DictConfig) else ()
+        offered = did_you_mean(str(error.key), choices)
     elif isinstance(error.__cause__, OmegaConfBaseException):  # it names the key and the value
         return _explained(error.__cause__)
     return composing.error_line(error) + offered
 
 
-def _malformed(word: str, said: str) -> str:
-    """Return what to type in place of a word that Hydra's grammar refuses, and says so."""
+def _malformed(word: str, message: str) -> str:
+    """Return a message with a correction of a word that Hydra's grammar refuses with a message."""
     key, _, value = word.partition("=")
-    call = _CALL.search(said)
+    call = _CALL.search(message)
     whole, name, inside = call.group("call", "name", "inside") if call else ("", "", "")
     axis = inside if inside.endswith(")") else whole
     candidates = (
@@ -153,7 +153,7 @@ def _malformed(word: str, said: str) -> str:
 
 
 def _closing(text: str) -> str:
-    """Return the brackets that close those that are open at the end of a text."""
+    """Return the brackets that close the open ones at the end of a text."""
     still_open: list[str] = []
     for sign in _QUOTED.sub("", text):
         if sign in _CLOSES:
@@ -164,7 +164,7 @@ def _closing(text: str) -> str:
 
 
 def _wrong_file(file: str, error: BaseException) -> str:
-    """Return what is wrong in a file of the config, which can't be merged into the others."""
+    """Return the message on a file of the config that can't be merged into the others."""
     group = file.partition("/")[0]
     key = str(getattr(error, "full_key", ""))
     if key not in config.types_of(config.Conf) and (key == group or key.startswith("_")):
@@ -175,10 +175,10 @@ def _wrong_file(file: str, error: BaseException) -> str:
 
 
 def _missing_file(file: str, options: Sequence[str]) -> str:
-    """Return what is said of `GROUP/NAME` where there is no such file of the config."""
+    """Return the message on a missing file `GROUP/NAME` of the config."""
     group = next((g for g in config.GROUPS if file.startswith(f"{g}/")), file.rpartition("/")[0])
     name = file.removeprefix(f"{group}/")
-    if not (known := sorted({*files(group), *options})):
+    if not (choices := sorted({*files(group), *options})):
         return f"{group}: there is no such key{did_you_mean(group, config.known_keys())}"
     if group == "scene" and user_path(name).is_dir():
         word = shlex.quote(f"scene.path={name}")
@@ -188,35 +188,35 @@ def _missing_file(file: str, options: Sequence[str]) -> str:
             f"ablation={name}: it is in a package of its own: pip install ./examples/arms, and"
             " xrgs-sweep --config-dir examples/arms/conf finds it"
         )
-    all_known = f"; choose from: {', '.join(known)}"
-    if len(known) > _MAX_LISTED:
-        all_known = f"; xrgs-sweep --help lists all {len(known)}"
-    offered = did_you_mean(name, known) or all_known
+    all_known = f"; choose from: {', '.join(choices)}"
+    if len(choices) > _MAX_LISTED:
+        all_known = f"; xrgs-sweep --help lists all {len(choices)}"
+    offered = did_you_mean(name, choices) or all_known
     return f"{group}={name}: there is no such choice{offered}"
 
 
 def with_options_first(words: Sequence[str]) -> list[str]:
-    """Return a command line as Hydra's parser takes it: its options first, then all overrides.
+    """Order a command line as Hydra's parser needs it: options first, then overrides.
 
-    `--multirun` is added where Hydra is asked for a sweep: without it, Hydra checks axes before
-    anything else, and blames them for every other mistake.
+    `--multirun` is added for a sweep: without it, Hydra checks axes first, and blames them for
+    every other mistake.
 
     Args:
         words: Arguments of the command line, in any order.
     """
     options: list[str] = []
     overrides: list[str] = []
-    left = list(words)
-    while left:
-        word = left.pop(0)
+    remaining = list(words)
+    while remaining:
+        word = remaining.pop(0)
         if not word.startswith("-"):
             overrides.append(word)
             continue
         name, _, value = word.partition("=")
-        if name in _HYDRA_VALUES - _INFO and not value and left:
-            value = left.pop(0)
+        if name in _HYDRA_VALUES - _INFO and not value and remaining:
+            value = remaining.pop(0)
         if name in _INFO and not value:
-            value = left.pop(0) if left and "=" not in left[0] else "all"
+            value = remaining.pop(0) if remaining and "=" not in remaining[0] else "all"
         if name in _FOLDERS and value:
             value = str(user_path(value))
         if name not in ("--multirun", "-m"):
@@ -228,18 +228,17 @@ def with_options_first(words: Sequence[str]) -> list[str]:
 
 
 def with_quotes(words: Sequence[str]) -> list[str]:
-    """Return Hydra overrides, with quotes around paths and names that Hydra would read otherwise.
+    """Put quotes around paths and names in overrides that Hydra's grammar would misread.
 
-    Paths and names may have any character; a value that is in quotes already stays as it is. Commas
-    in `scene.path` and in groups of files separate the values of an axis, unless there is a folder
-    of that name. A list of names is `[a,b]`, or `a,b`; `[a,b],[c]` is an axis of two lists. Hydra
-    reads all other keys.
+    Paths and names may have any character; a quoted value stays as it is. Commas in `scene.path`
+    and in groups of files separate the values of an axis, unless a folder has that name. A list of
+    names is `[a,b]`, or `a,b`; `[a,b],[c]` is an axis of two lists. Values of other keys stay.
 
     Args:
         words: Arguments of the command line.
 
     Raises:
-        XrgsError: A word is not valid Unicode, and no file could be written with it.
+        XrgsError: A word is not valid Unicode.
     """
     for word in words:
         if not word.isascii() and word.encode(errors="replace").decode() != word:
@@ -271,7 +270,7 @@ def _with_quotes(word: str) -> str:
 
 
 def _is_whole_number(key: str) -> bool:
-    """Return whether a key of the schema is a whole number."""
+    """Return whether the schema's type of a key is int."""
     kind: Any = config.Conf
     for name in key.split("."):
         kind = config.types_of(cast("Any", kind)).get(name) if is_dataclass(kind) else None
@@ -279,7 +278,7 @@ def _is_whole_number(key: str) -> bool:
 
 
 def _whole(text: str) -> str:
-    """Return a whole number as digits, `3000` for `3e3`; another text as it is."""
+    """Write a whole number as digits, `3e3` as `3000`; any other text stays."""
     if not _WHOLE.fullmatch(text.strip()) or not (value := float(text)).is_integer():
         return text
     return str(int(value))
@@ -292,12 +291,12 @@ def _exists(path: str) -> bool:
 def _literal(text: str) -> str:
     """Escape `${` in a text, unless each interpolation in it names a key or a resolver."""
     named = _INTERPOLATED.findall(text)
-    known = (name.startswith(("oc.", "hydra")) or name in config.known_keys() for name in named)
-    return text if named and all(known) else escape_interpolations(text)
+    valid = (name.startswith(("oc.", "hydra")) or name in config.known_keys() for name in named)
+    return text if named and all(valid) else escape_interpolations(text)
 
 
 def _parsed(word: str) -> Override | None:
-    """Return what Hydra reads from a word; None where its grammar refuses the word."""
+    """Parse a word by Hydra's grammar; None if the grammar refuses it."""
     with suppress(HydraException):
         (override,) = OverridesParser.create().parse_overrides([word])
         return override
@@ -309,14 +308,14 @@ def _quoted_path(key: str, value: str) -> str:
         return _quoted(key, escape_interpolations(value))
     value = _literal(value)
     override = _parsed(f"{key}={value}")
-    # The word null, and the escapes of Hydra's grammar, where there is no file of that name.
+    # No file has that name: keep `null` and escapes of Hydra's grammar.
     if override and (override.value() is None or "\\" in value):
         return value
     return _quoted(key, value)
 
 
 def _quoted(key: str, value: str) -> str:
-    """Return a text in quotes, or as it is if Hydra reads it as it is written."""
+    """Quote a text, unless Hydra reads it unchanged without quotes."""
     override = _parsed(f"{key}={value}")
     if override and not override.is_sweep_override() and override.value() == value:
         return value
@@ -324,7 +323,7 @@ def _quoted(key: str, value: str) -> str:
 
 
 def _quoted_choice(key: str, value: str) -> str:
-    """Return the name of a file of a group, or a list of names, as Hydra reads names."""
+    """Quote the name of a file of a group, or each name of a list."""
     if value[:1] == "[" and value[-1:] == "]":
         names = [part.strip() for part in _parts(value[1:-1])]
         return f"[{','.join(n if _QUOTED.fullmatch(n) else _quoted(key, n) for n in names)}]"
@@ -332,7 +331,7 @@ def _quoted_choice(key: str, value: str) -> str:
 
 
 def _quoted_lists(value: str) -> str:
-    """Return one list of names, or several that are an axis, with quotes around each name."""
+    """Quote each name of a list, or of several lists that are an axis."""
     if value.startswith("${") and value == _literal(value):
         return value
     lists = [part.strip() for part in _parts(value)]
@@ -349,7 +348,7 @@ def _quoted_name(name: str) -> str:
 
 
 def _parts(text: str) -> list[str]:
-    """Split a text at its commas, but for those in quotes and, where they balance, in brackets."""
+    """Split a text at commas, except in quotes and, if the brackets balance, in brackets."""
     shape = _QUOTED_PART.sub(lambda quoted: "'" * len(quoted[0]), text)
     depths = list(accumulate(_DEPTH.get(char, 0) for char in shape))
     if depths and (min(depths) < 0 or depths[-1]):
@@ -359,17 +358,17 @@ def _parts(text: str) -> list[str]:
 
 
 def check_words(words: Sequence[str]) -> None:
-    """Refuse words that are no overrides of Hydra and none of its options, and say what was meant.
+    """Refuse words that are neither overrides nor options of Hydra.
 
     Raises:
-        XrgsError: A folder, an option of another command, or a list with spaces; the message has
-            what to type.
+        XrgsError: A word is a folder, an option of another command, or part of a list with spaces;
+            the message has the correction.
     """
     before = ""
     for number, word in enumerate(words):
         key, is_assignment, _ = word.partition("=")
         name = key.lstrip("-").replace("-", "_")
-        if before in _HYDRA_VALUES:  # its value
+        if before in _HYDRA_VALUES:  # this word is the option's value
             before = ""
             continue
         is_option = word.startswith("-") and key not in _HYDRA_OPTIONS | _HYDRA_VALUES
@@ -400,7 +399,7 @@ def _meant(word: str, before: str) -> str:
 
 
 def check_no_axis(words: Sequence[str]) -> None:
-    """Refuse overrides with several values, where one cell is trained.
+    """Refuse overrides with several values, since one cell is trained.
 
     Raises:
         XrgsError: An override is an axis; the message names it.
@@ -411,10 +410,10 @@ def check_no_axis(words: Sequence[str]) -> None:
 
 
 def files(group: str) -> list[str]:
-    """Return the names of a config group's files, sorted; empty where there is no such group.
+    """Return the sorted names of a config group's files; empty if there is no such group.
 
     Args:
-        group: Name of the group's folder, as `scene`.
+        group: Name of the group's folder, such as `scene`.
     """
     folder = config.CONF_DIR / group
     folder = folder if folder.is_dir() else config.CONF_DIR.parent / group

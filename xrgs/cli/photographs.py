@@ -1,4 +1,4 @@
-"""The overrides for photographs as they are, which several commands take by their folder."""
+"""Makes overrides for a folder of photographs, or a video, that commands take by its path."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
 
-def as_they_are(given: str) -> list[str]:
-    """Return the overrides for a folder of photographs, or for a video, of which none is degraded.
+def as_they_are(photographs: str) -> list[str]:
+    """Return the overrides for a folder of photographs, or a video, without any degradation.
 
-    What the photographs show tells how fine they are, and which are HR.
+    Views are tagged HR and LR by their measured sampling rates.
 
     Args:
-        given: The folder, the folder with `/**`, or the video.
+        photographs: The folder, the folder with `/**`, or the video.
 
     Raises:
-        XrgsError: There is neither of that name.
+        XrgsError: There is no such folder or video.
     """
-    path = user_path(given.removesuffix(ALL_BELOW))
+    path = user_path(photographs.removesuffix(ALL_BELOW))
     if path.suffix.lower() in SUFFIXES and not path.is_dir():
-        raise XrgsError(f"{given}: is a photograph; name the folder that it is in")
+        raise XrgsError(f"{photographs}: is a photograph; name the folder that it is in")
     if not path.exists():
-        raise XrgsError(f"{given}: there is no such folder or video")
+        raise XrgsError(f"{photographs}: there is no such folder or video")
     kind = "folder" if path.is_dir() else "video"
     if kind == "video" and path.suffix.lower() not in VIDEOS:
-        raise XrgsError(f"{given}: is neither a folder of photographs nor a video")
-    # Nothing is cropped, and two photographs to train on are enough.
+        raise XrgsError(f"{photographs}: is neither a folder of photographs nor a video")
+    # `factor=1` crops nothing, and with `min_hr=1` two training photographs are enough.
     variant = ("variant=sampling_rate", "variant.factor=1", "variant.min_hr=1")
-    return [f"scene={kind}", f"scene.path={given}", *variant]
+    return [f"scene={kind}", f"scene.path={photographs}", *variant]
 
 
 def last_of_each_key(words: Iterable[str]) -> list[str]:
-    """Return overrides without those whose key a later one has, which Hydra refuses for groups."""
+    """Keep only the last override of each key: Hydra refuses a group that is given twice."""
     return list({word.lstrip("+").partition("=")[0]: word for word in words}.values())

@@ -35,26 +35,26 @@ def render(
     Args:
         cells: One cell or two, each by its id, the beginning of its id, the name of a scene with
             one done cell, or a file: .ply, .glb or .spz.
-        path: The path, fitted to the training cameras; by default `orbit`, or `training` where an
+        path: The path, fitted to the training cameras; by default `orbit`, or `training` if an
             orbit would leave the space that they see, as in a room seen from inside. `orbit`
-            circles around the point that they look at; where they see it only from one side, it
-            swings over the arc that they span. `training` goes along them in their order. `spiral`
-            is LLFF's, for forward-facing scenes. `test` goes through the test cameras in
-            their order. On every path, all frames have the focal length of the first one.
+            circles around the point that they look at; if they see it only from one side, it
+            swings over their arc. `training` goes along the training cameras in their order.
+            `spiral` is LLFF's, for forward-facing scenes. `test` goes through the test cameras in
+            their order. On every path, all frames have the focal length of the first test view.
         views: Number of frames.
         out: An .mp4 file, which needs PyAV (pip install 'xrgs[video]'), or a new folder for PNG
             frames.
-        size: Size of one cell's picture in pixels, both even; by default the size of the test
+        size: Width and height of one cell's picture, px, both even; by default the size of the test
             views.
-        fps: Frames a second.
+        fps: Frames per second.
         antialiased: Whether to compensate opacities for the blur of a pixel, as Mip-Splatting does;
-            by default as the cell was trained, or as the file says.
+            by default as in the cell's training, or as the file says.
         store: The store that has the cells.
     """
     from xrgs.viewer.film import make_film
     from xrgs.viewer.models import load_models
 
-    with exit_on_signal("A film that is not complete is not kept; single frames are."):
+    with exit_on_signal("An incomplete film is removed; PNG frames are kept."):
         models = load_models(cells, Store(store), _CHOICES[antialiased])
         line = make_film(models, out, path=path, views=views, size=size, fps=fps)
     say(line)

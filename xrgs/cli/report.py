@@ -1,4 +1,4 @@
-"""`xrgs-report`: makes the tables and figures of sweeps, from the store alone, and lists sweeps."""
+"""`xrgs-report`: makes the tables and figures of sweeps from a store, and lists its sweeps."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from xrgs.runtime.streams import say
 from xrgs.store.store import BASELINE, Store
 
 _DESCRIPTION = """\
-Make the tables and figures of a sweep from a store alone; the same store gives the same bytes.
+Make the tables and figures of a sweep, only from its store; the same store gives the same bytes.
 
 report.html is a page with all of it, the photographs and the Gaussians: one file, without network.
 The report of a sweep that runs or was stopped has the cells that are done."""
@@ -36,26 +36,25 @@ def report(
 
     Args:
         store: The store.
-        sweep: The sweep: its id, the beginning of it, or the name of a scene for the latest sweep
-            of it. Several are joined, for example one of each scene. By default the latest.
+        sweep: The sweep: its id, the beginning of its id, or the name of a scene for the scene's
+            latest sweep. Several are joined, for example one of each scene. By default the latest.
         scenes: The scenes in the report; all by default.
-        ablations: The ablations in the report, beside what they are compared with; all by default.
-        out: Folder to write to. By default reports/ID in the store; with a choice
-            reports/ID.scenes-NAMES or reports/ID.ablations-NAMES, and with another label to compare
-            with reports/ID.against-LABEL.
-        pictures: `all`, `none`, or names of figures without their ending, such as `trade-off` or
+        ablations: The ablations in the report, beside their base; all by default.
+        out: Folder to write to. By default reports/ID in the store; with --scenes or --ablations
+            reports/ID.scenes-NAMES or reports/ID.ablations-NAMES, and with --against
+            reports/ID.against-LABEL.
+        pictures: `all`, `none`, or names of figures without their suffix, such as `trade-off` or
             `fern--plus`. `none` leaves the pictures of report.html out too.
-        against: The label that all others are compared with. In a sweep with `baseline=false` it is
-            the first by default.
+        against: The label that all others are compared with (the base). In a sweep with
+            `baseline=false` it is the first label by default.
         external: Another program's renders of the test views, as one more label. FOLDER has
-            SCENE/VIEW.png, or VIEW.png where there is one scene, as 8-bit RGB of the photograph's
-            size.
+            SCENE/VIEW.png, or VIEW.png if there is one scene: 8-bit RGB, of the photograph's size.
         outcomes: The metrics that have a verdict, and whose tests are corrected together; all
-            others are descriptive. Name them before the data. By default psnr, psnr_pooled,
-            psnr_worst, lpips, evaluations and gaussians.
+            others are descriptive. Name them before you have the data. By default psnr,
+            psnr_pooled, psnr_worst, lpips, evaluations and gaussians.
         headline: The labels of a study's claims: their tests are corrected by Holm.
-        margin_psnr: A change of PSNR that is shown to be smaller is called equivalent, dB.
-        margin_lpips: The same for LPIPS, %.
+        margin_psnr: A change of PSNR that is shown to be below this is called equivalent, dB.
+        margin_lpips: A change of LPIPS that is shown to be below this is called equivalent, %.
     """
     from xrgs.report import Choice, Design, build
     from xrgs.report.external import parse

@@ -15,7 +15,7 @@ def status(store: Folder = STORE, watch: Flag = False) -> None:
 
     Args:
         store: The store.
-        watch: Show the cells in training, again and again until Ctrl-C, which ends no training.
+        watch: Show the cells in training, updated until Ctrl-C; the trainings go on after it.
     """
     from xrgs.sweep.status import describe, read
     from xrgs.sweep.status import watch as watch_store

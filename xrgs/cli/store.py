@@ -1,4 +1,4 @@
-"""`xrgs-store`: lists, removes, packs, imports, scores anew and verifies the items of a store."""
+"""`xrgs-store`: lists, removes, packs, imports, rescores and verifies the content of a store."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Filter:
-    """Which cells of a store are meant."""
+    """Options that choose cells of a store."""
 
     ids: Positional[Cells] = ()
     """Cells: ids, beginnings of ids, or scenes with one done cell; all by default."""
@@ -46,33 +46,33 @@ class Filter:
     """The store."""
 
     def selection(self) -> Selection:
-        """Return the options as the functions of the store take them."""
+        """Convert the options for the functions of `xrgs.store`."""
         from xrgs.store.listing import Selection
 
         names = self.ids, self.scenes, self.ablations, self.states, self.sweep
         return Selection(*names, self.older_days, self.larger_mb)
 
     def chosen(self) -> tuple[list[CellRow], list[CellRow]]:
-        """Return all cells of the store, and the cells that are meant."""
+        """Return all cells of the store, and the chosen ones."""
         cells = Store(self.store).cell_rows()
         return cells, self.selection().choose_from(cells)
 
 
 @dataclass(frozen=True)
 class Removal:
-    """Whether something is removed; without `yes` a terminal is asked, if there is one."""
+    """Options of commands that remove files; without `yes` they ask on the terminal."""
 
     dry_run: Flag = False
-    """Say what would be removed, and how much, and stop."""
+    """Say what would be removed and its size, and stop."""
     yes: Flag = False
     """Remove it without asking."""
 
     def carry_out(self, store: Store, plan: Plan) -> None:
-        """Say what a plan removes, and do it if that is confirmed.
+        """Print a plan of removal, and carry it out if it is confirmed.
 
         Raises:
-            XrgsError: It is not confirmed.
-            SystemExit: With code 1, where something was left.
+            XrgsError: The plan is not confirmed.
+            SystemExit: With code 1, if something could not be removed.
         """
         from xrgs.runtime.text import format_size
         from xrgs.sweep.cleaning import carry_out
@@ -82,9 +82,9 @@ class Removal:
             return
         if not (self.yes or _confirmed(f"{plan.verb} {plan.total}?")):
             raise XrgsError("nothing was done; --yes does it without asking")
-        freed, left = carry_out(store, plan)
+        freed, remaining = carry_out(store, plan)
         say(f"freed {format_size(freed)}")
-        _say_left(left)
+        _say_left(remaining)
 
 
 def list_cells(cells: Filter, sort: Literal["name", "age", "size"] = "name") -> None:
@@ -103,7 +103,7 @@ def show(cell: Positional[Annotated[str, arg(metavar="CELL")]], store: Folder = 
     """Show a cell: how its config differs from its baseline, scores, files, provenance, sweeps.
 
     Args:
-        cell: The cell's id, or the beginning of it, or the name of a scene with one done cell.
+        cell: The cell's id, the beginning of its id, or the name of a scene with one done cell.
         store: The store.
     """
     from xrgs.store.listing import Selection
@@ -118,7 +118,7 @@ def rm(cells: Filter, removal: Removal) -> None:
 
     Args:
         cells: The cells that pass all of these options.
-        removal: Without --yes the terminal is asked; without a terminal, nothing is removed.
+        removal: Without --yes the command asks; without a terminal, nothing is removed.
     """
     from xrgs.sweep.cleaning import plan_removal
 
@@ -131,11 +131,11 @@ def rm(cells: Filter, removal: Removal) -> None:
 def trim(cells: Filter, removal: Removal, variants: Flag = False) -> None:
     """Remove the Gaussians and renders of done cells.
 
-    The cells stay done, and tables of them can be made.
+    The cells stay done, and their tables can still be made.
 
     Args:
         cells: The cells that pass all of these options.
-        removal: Without --yes the terminal is asked; without a terminal, nothing is removed.
+        removal: Without --yes the command asks; without a terminal, nothing is removed.
         variants: Also remove the images of their variants. A sweep with further cells makes the
             images again from the photographs.
     """
@@ -148,9 +148,9 @@ def trim(cells: Filter, removal: Removal, variants: Flag = False) -> None:
 def pack(cells: Filter, out: Annotated[Path, arg(metavar="FILE.tar.xz")]) -> None:
     """Pack done cells into an archive for others.
 
-    It has no Gaussians and renders; it has their variants without images, and the records of their
-    sweeps, or of the sweeps that are named. Full paths in configs and commands become relative.
-    Unpacked, it is a store: reports can be made, and sweeps continued.
+    The archive has the cells without Gaussians and renders, their variants without images, and the
+    records of their sweeps, or of those in --sweep. Full paths in configs and commands become
+    relative. Unpacked, it is a store: reports can be made, and sweeps continued.
 
     Args:
         cells: The cells that pass all of these options.
@@ -175,8 +175,8 @@ def import_(
 ) -> None:
     """Copy the store of somebody else into this one, after every file is checked.
 
-    Cells that are not done, checkpoints, logs and reports are not imported. What is damaged is left
-    out and named. An import that was stopped goes on when it is run again.
+    Unfinished cells, checkpoints, logs and reports are not imported. Damaged cells and variants are
+    left out and named. An import that was stopped continues when it is run again.
 
     Args:
         source: An archive (.tar, .tar.xz, .tar.gz), or the folder of a store.
@@ -197,10 +197,10 @@ def gc(
     """Remove what no sweep of the installed code needs.
 
     Args:
-        removal: Without --yes the terminal is asked; without a terminal, nothing is removed.
-        of: old_code (cells that other code has trained), failed (tries of cells and scenes), aside
-            (folders of earlier attempts that were set aside), variants (of which no cell is left).
-            All of it by default.
+        removal: Without --yes the command asks; without a terminal, nothing is removed.
+        of: Kinds to remove, all by default: old_code (cells trained by other code), failed (failed
+            attempts of cells and scenes), aside (folders of earlier attempts that were set aside),
+            variants (without cells).
         store: The store.
     """
     from xrgs.sweep.cleaning import plan_gc
@@ -209,10 +209,10 @@ def gc(
 
 
 def rescore(cells: Filter, also: Names = ()) -> None:
-    """Score done cells anew where a metric was added or changed; nothing is trained.
+    """Score done cells again after a metric was added or changed; nothing is trained.
 
-    The cells' Gaussians are rendered and scored by the installed metrics. Cells whose scores are of
-    the installed code already are left as they are.
+    The cells' Gaussians are rendered and scored by the installed metrics. Cells that the installed
+    code has scored are skipped.
 
     Args:
         cells: The cells that pass all of these options.
@@ -246,10 +246,10 @@ def check(store: Folder = STORE) -> None:
 
 
 def _say_left(lines: Sequence[str]) -> None:
-    """Print the lines on things that were left, with the reasons.
+    """Print lines on what was left out or not removed, to stderr.
 
     Raises:
-        SystemExit: With code 1, where anything was.
+        SystemExit: With code 1, if there is any line.
     """
     for line in lines:
         say(line, sys.stderr)
@@ -258,7 +258,7 @@ def _say_left(lines: Sequence[str]) -> None:
 
 
 def _confirmed(question: str) -> bool:
-    """Ask on the terminal; without one, nobody has answered."""
+    """Ask on the terminal; without a terminal the answer is no."""
     if not sys.stdin.isatty():
         return False
     say(f"{question} [y/N]", sys.stderr)

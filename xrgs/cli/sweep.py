@@ -24,7 +24,7 @@ from xrgs.safeio.paths import user_path
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-#: The variable of the environment by which Hydra leaves errors to its caller.
+#: With this environment variable Hydra leaves errors to its caller.
 _FULL_ERROR = "HYDRA_FULL_ERROR"
 
 _HELP = """\
@@ -59,24 +59,24 @@ xrgs-sweep: say what to train:
 
 @dataclass
 class PhotographsConf:
-    """Where the photographs of a scene are now."""
+    """The present folder of a scene's photographs."""
 
     path: str | None = None
-    """Folder of the photographs; None for the one in the cell's config."""
+    """The folder; None for the one in the cell's config."""
 
 
 @dataclass
 class RerunConf:
-    """Arguments of `xrgs-sweep rerun=...`; any other value would make it another cell."""
+    """Arguments of `xrgs-sweep rerun=...`; no others are allowed, since they change the cell."""
 
     rerun: str = MISSING
-    """The cell: its folder, or its name in the store."""
+    """The cell: its folder, or a word for `Store.find_cell`."""
     out: str | None = None
     """Folder to write to; None for `<rerun>.rerun-1` or the next free number."""
     store: str | None = None
-    """Store that has the cell's variant; None for the one that the folder is in."""
+    """Store with the cell's variant; None for the store around the cell's folder."""
     threads: int | None = None
-    """Number of threads; None for as many as the cell was trained with."""
+    """Number of threads; None for the number in the cell's training."""
     scene: PhotographsConf = field(default_factory=PhotographsConf)
     plugins: str = ""
     """Names of components of other packages that the cell may import, separated by commas."""
@@ -106,7 +106,7 @@ def main() -> None:
         sys.exit(2)
     with errors_as_messages("xrgs-sweep"):
         check_words(arguments)
-    # The plus that Hydra requires before these two is forgotten easily.
+    # Hydra requires a plus before these groups, which is easily forgotten.
     words = ["+" + w if w.partition("=")[0] in config.PLUS_GROUPS else w for w in arguments]
     run("xrgs-sweep", words, "Finished cells are kept: run the same command again to continue.")
 
@@ -117,10 +117,10 @@ def run(command: str, words: Sequence[str], hint: str) -> None:
     Args:
         command: Name of the command, which begins messages.
         words: The arguments of `xrgs-sweep`.
-        hint: A text for the end by a signal: what is kept, and how to continue.
+        hint: The message if a signal ends the sweep: what is kept, and how to continue.
 
     Raises:
-        SystemExit: With code 1 where a cell failed; with a message where the user can correct the
+        SystemExit: With code 1 if a cell failed; with a message if the user can correct the
             problem.
     """
     with exit_on_signal(hint), _hydra_errors(command):
@@ -135,10 +135,10 @@ def run(command: str, words: Sequence[str], hint: str) -> None:
 
 @contextmanager
 def _hydra_errors(command: str) -> Iterator[None]:
-    """Say errors that the user can correct in one line, and show any other one with its traceback.
+    """Print errors that the user can correct in one line, and all others with their traceback.
 
-    Hydra would add to each that a variable of the environment shows a traceback. It leaves errors
-    to us where that variable is set; users who set it themselves see a traceback of every error.
+    Without `HYDRA_FULL_ERROR`, Hydra would handle errors itself and advise to set it. Users who
+    have set it see the traceback of every error.
     """
     if _FULL_ERROR in os.environ:
         yield
@@ -160,9 +160,9 @@ def _rerun(arguments: list[str]) -> None:
         conf = OmegaConf.merge(OmegaConf.structured(RerunConf), texts(arguments))
         out, store = (user_path(path) if path else None for path in (conf.out, conf.store))
         photographs, plugins = conf.scene.path, conf.plugins.split(",")
-        cell, there = Path(conf.rerun), Store(store or DEFAULT_STORE)
-        if not cell.exists() and there.exists:
-            cell = there.find_cell(conf.rerun).path
+        cell, home = Path(conf.rerun), Store(store or DEFAULT_STORE)
+        if not cell.exists() and home.exists:
+            cell = home.find_cell(conf.rerun).path
         result = rerun(cell, out, store, conf.threads, photographs, plugins)
     say(str(result))
     if result.differences:
@@ -170,7 +170,7 @@ def _rerun(arguments: list[str]) -> None:
 
 
 def texts(words: Sequence[str]) -> DictConfig:
-    """Return `KEY=VALUE` words as a config of texts, which a merge into a schema converts."""
+    """Convert `KEY=VALUE` words to a config of texts; a merge into a schema converts the values."""
     conf = OmegaConf.create({})
     for word in words:
         key, _, value = word.partition("=")

@@ -1,7 +1,7 @@
-"""`xrgs-train`: makes a scene of photographs, or of a video, as they are.
+"""`xrgs-train`: makes a scene of photographs, or of a video, without degrading them.
 
-It looks at the photographs, finds their cameras, chooses a recipe, and trains one cell by what
-`xrgs-sweep` calls. All that it decides are overrides of Hydra, and the user's own replace them.
+It inspects the photographs, finds their cameras, chooses a recipe, and trains one cell by the code
+of `xrgs-sweep`. All its choices are overrides of Hydra, which the user's own overrides replace.
 """
 
 from __future__ import annotations
@@ -39,35 +39,35 @@ if TYPE_CHECKING:
     from xrgs.store.cell_folder import CellFolder
     from xrgs.store.inspect import Mixture, SfmReport
 
-#: The overrides of each quality.
+#: --quality -> its overrides.
 _QUALITIES = {
     "draft": ("preset=laptop", "variant.long_side=336", "train.steps=1000"),
     "normal": ("preset=laptop",),
     "high": ("preset=paper", "train.evaluate_every=0"),
 }
-#: Steps from which on a run has the settings of `preset=paper`; and the steps of a shorter run
-#: between two refinements, those of `preset=laptop`: with fewer, more grows than it can train.
+#: Runs of at least _LONG_RUN steps have the settings of `preset=paper`. Shorter runs refine every
+#: _REFINED_EVERY steps, as `preset=laptop` does; more refinements grow more than they can train.
 _LONG_RUN, _REFINED_EVERY = 10_000, 50
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What is made of which photographs."""
+    """The options of `xrgs-train`."""
 
     photographs: Positional[Annotated[str, arg(metavar="FOLDER|VIDEO")]]
     """Folder of photographs of one place (FOLDER/** with all folders below), or a video."""
     overrides: Positional[Annotated[tuple[str, ...], shown_as("KEY=VALUE ...")]] = ()
-    """Keys of xrgs-sweep, as train.steps=5000 or seed=1; they replace what is chosen."""
+    """Keys of xrgs-sweep, such as train.steps=5000 or seed=1; they replace the chosen values."""
     minutes: Annotated[float | None, shown_as("N")] = None
-    """Choose size and steps so that all takes about so long on this machine."""
+    """Choose size and steps so that the command takes about N minutes on this machine."""
     quality: Literal["draft", "normal", "high"] = "normal"
-    """1,000 steps at 336 px; 3,000 at 504 px; or 30,000 at 1,008 px."""
+    """draft: 1,000 steps at 336 px; normal: 3,000 at 504 px; high: 30,000 at 1,008 px."""
     size: Annotated[int | None, shown_as("PX")] = None
-    """Longer side of the photographs that are trained on; 0 keeps their size."""
+    """Longer side of the photographs in training; 0 keeps their size."""
     recipe: Annotated[str | None, shown_as("NAME[,NAME]")] = None
-    """Ablations of xrgs-sweep, trained together; by default what suits the photographs."""
+    """Ablations of xrgs-sweep, trained together; by default chosen for the photographs."""
     hold_none: Annotated[Flag, arg(name="all")] = False
-    """Train on all photographs; otherwise every eighth is held out, to tell the quality."""
+    """Train on all photographs; otherwise every eighth is held out, to measure the quality."""
     masks: OptionalFolder = None
     """Folder of the photographs' masks: white is used, black is not."""
     out: Annotated[Path | None, shown_as("FILE|FOLDER")] = None
@@ -75,24 +75,25 @@ class Settings:
     dry_run: Flag = False
     """Say which photographs there are, and stop."""
     store: Folder = STORE
-    """Folder that keeps all that is made."""
+    """Folder for all results."""
 
 
 @dataclass
 class _Words:
-    """The arguments of `xrgs-sweep`; a later word replaces an earlier one of its key."""
+    """The arguments of `xrgs-sweep`; a later word replaces an earlier one with the same key."""
 
     given: Sequence[str]
-    """Those of the user, which replace all others."""
+    """The user's words, which replace all others."""
     own: list[str] = field(default_factory=list)
+    """Words that this command has chosen."""
 
     @property
     def all(self) -> list[str]:
-        """All of them."""
+        """All words, one for each key."""
         return last_of_each_key([*self.own, *self.given])
 
     def value(self, key: str) -> str:
-        """Return the value of a key; empty where no word has it."""
+        """Return the value of a key; empty if no word has it."""
         values = (word.lstrip("+").partition("=") for word in self.all)
         return next((value for name, _, value in values if name == key), "")
 
@@ -111,11 +112,11 @@ class _Words:
 def train(settings: Settings) -> None:
     """Make a 3D scene of photographs: find the cameras, train, and write a page with the result.
 
-    Run again, it finds what is done. Then xrgs-view shows the scene, xrgs-render makes a film of
-    it, and xrgs-data export writes it for other programs.
+    The same command continues after an interruption. Afterwards xrgs-view shows the scene,
+    xrgs-render makes a film of it, and xrgs-data export writes it for other programs.
 
     Args:
-        settings: What is made of which photographs.
+        settings: The options.
     """
     begin = time.monotonic()
     if settings.minutes is not None and (settings.quality != "normal" or not settings.minutes > 0):
@@ -127,53 +128,53 @@ def train(settings: Settings) -> None:
         side = budget.size_for(60 * settings.minutes, _measured_unit(words.compose()))
         words.own.append(f"variant.long_side={side}")
     with exit_on_signal("Run the same command again to continue."):
-        found = _look(words)
-        if found is None:
+        placed = _place(words)
+        if placed is None:
             return
-        words.own += _recipe(settings.recipe or found.mixture.recipe)
+        words.own += _recipe(settings.recipe or placed.mixture.recipe)
         trial = None
         if settings.minutes:
-            trial = _tried(found, words.compose())
-            left = 60 * settings.minutes - (time.monotonic() - begin) - trial.start_s
-            _choose_steps(words, settings, trial.step_s, left)
+            trial = _trial(placed, words.compose())
+            left_s = 60 * settings.minutes - (time.monotonic() - begin) - trial.start_s
+            _choose_steps(words, settings, trial.step_s, left_s)
         steps = words.compose().train.steps
         if steps < _LONG_RUN:
             words.own.append(f"splat.densify.every={_REFINED_EVERY * NOMINAL_STEPS // steps}")
         conf = words.compose()
         recipe = words.value("ablation") or BASELINE
-        what = f"{recipe}: {conf.train.steps:,} steps at {conf.variant.long_side} px"
-        if _cell(found, conf).state(verify=False).name == "done":
-            _say(f"trained already by {what}")
+        description = f"{recipe}: {conf.train.steps:,} steps at {conf.variant.long_side} px"
+        if _cell(placed, conf).state(verify=False).name == "done":
+            _say(f"trained already by {description}")
         else:
-            _say(f"training by {what}, {format_duration(_expected_s(found, conf, trial))}")
+            _say(f"training by {description}, {format_duration(_expected_s(placed, conf, trial))}")
     again = "the command above continues" if settings.minutes else "run it again to continue"
     hint = f"What is done is kept: {again}."
     sweep.run("xrgs-train", [*words.all, "hydra.sweeper.brief=true"], hint)
-    _say_end(found, conf, settings, time.monotonic() - begin)
+    _say_end(placed, conf, settings, time.monotonic() - begin)
 
 
 def _words(settings: Settings) -> _Words:
-    """Return the words that are known before the photographs are looked at."""
-    own = [*as_they_are(settings.photographs), f"store={settings.store}"]
-    own += ["retry=failed", "lpips.fetch=false", *_QUALITIES[settings.quality]]
-    own += [f"variant.long_side={settings.size}"] if settings.size is not None else []
-    own += ["variant.test_every=0"] if settings.hold_none else []
-    own += [f"scene.masks={settings.masks}"] if settings.masks else []
-    own += ["dry_run=true"] if settings.dry_run else []
-    return _Words(settings.overrides, own)
+    """Return the words that don't depend on the photographs."""
+    words = [*as_they_are(settings.photographs), f"store={settings.store}"]
+    words += ["retry=failed", "lpips.fetch=false", *_QUALITIES[settings.quality]]
+    words += [f"variant.long_side={settings.size}"] if settings.size is not None else []
+    words += ["variant.test_every=0"] if settings.hold_none else []
+    words += [f"scene.masks={settings.masks}"] if settings.masks else []
+    words += ["dry_run=true"] if settings.dry_run else []
+    return _Words(settings.overrides, words)
 
 
 @dataclass(frozen=True)
-class _Found:
-    """What is known of the photographs, once their cameras are found."""
+class _Placed:
+    """The result of `_place`: the variant with the found cameras."""
 
     variant_id: str
     mixture: Mixture
     report: SfmReport
 
 
-def _look(words: _Words) -> _Found | None:
-    """Find the photographs and their cameras, and say so; None in a dry run, which trains nothing.
+def _place(words: _Words) -> _Placed | None:
+    """Find the photographs and their cameras, and print both; return None in a dry run.
 
     Raises:
         XrgsError: There are too few photographs, or too few are placed.
@@ -199,41 +200,41 @@ def _look(words: _Words) -> _Found | None:
     for note in notes:
         _say(f"  {note}")
     if planned.id is None:
-        _say("without --dry-run, their cameras are found, and a recipe is chosen for what they are")
+        _say("without --dry-run, their cameras are found, and a recipe is chosen for them")
         return None
     report = ReportStore(store).variant_report(planned.id)
-    found = mixture(read_views(store.variants, planned.id))
+    mix = mixture(read_views(store.variants, planned.id))
     _say(f"{name}: the cameras of {report.registered} of {report.images} {kind}s are found")
     _say(
-        f"{name}: {'a mixture' if found.is_one else f'{kind}s alike'}: {found.coarse or 'none'}"
-        f" of {found.views} to train on are 1.5 times or more as coarse as the finest"
+        f"{name}: {'a mixture' if mix.is_one else f'{kind}s alike'}: {mix.coarse or 'none'}"
+        f" of {mix.views} to train on are 1.5 times or more as coarse as the finest"
     )
-    return None if conf.dry_run else _Found(planned.id, found, report)
+    return None if conf.dry_run else _Placed(planned.id, mix, report)
 
 
 def _recipe(names: str) -> list[str]:
-    """Return the words for a recipe: one ablation, several that are joined, or the baseline."""
+    """Return the words for a recipe: one ablation, several joined by commas, or the baseline."""
     if names == BASELINE:
         return []
     return [f"+ablation=[{names}]" if "," in names else f"+ablation={names}", "baseline=false"]
 
 
 def _measured_unit(conf: Conf) -> float:
-    """Measure how quickly this machine trains: seconds a step, for each pixel and Gaussian."""
+    """Measure this machine's speed: seconds per step for each pixel and Gaussian."""
     from xrgs.bench.speed import seconds_per_unit
 
     return seconds_per_unit(conf.threads or usable_cores(), conf.splat.backend)
 
 
-def _tried(found: _Found, conf: Conf) -> Trial:
-    """Measure how quickly this machine trains these photographs."""
+def _trial(placed: _Placed, conf: Conf) -> Trial:
+    """Measure this machine's speed on these photographs by a short training."""
     from xrgs.bench.speed import trial
 
-    return trial(conf, Store(conf.store).variants / found.variant_id)
+    return trial(conf, Store(conf.store).variants / placed.variant_id)
 
 
 def _choose_steps(words: _Words, settings: Settings, step_s: float, left_s: float) -> None:
-    """Choose the steps for the time that is left, and say how to have the same ones again."""
+    """Choose the steps for the remaining time, and print a command that repeats this training."""
     conf = words.compose()
     steps = budget.steps_for(left_s, step_s)
     quality = "high" if steps >= _LONG_RUN else "normal"
@@ -248,33 +249,33 @@ def _choose_steps(words: _Words, settings: Settings, step_s: float, left_s: floa
     _say(f"chosen for {settings.minutes:g} min; the same again, bit for bit: {shlex.join(again)}")
 
 
-def _expected_s(found: _Found, conf: Conf, trial: Trial | None) -> float:
-    """Return the expected seconds of a training: of the trial, finished cells or a measurement."""
+def _expected_s(placed: _Placed, conf: Conf, trial: Trial | None) -> float:
+    """Return the expected seconds of a training, by the trial, finished cells or a measurement."""
     from xrgs.sweep.estimate import CostEstimator
 
     if trial is not None:
         return trial.start_s + conf.train.steps * trial.step_s
     threads = conf.threads or usable_cores()
-    cost = CostEstimator(Store(conf.store)).cost(conf, found.variant_id, threads)
+    cost = CostEstimator(Store(conf.store)).cost(conf, placed.variant_id, threads)
     if cost is not None:
         return cost.seconds
-    return conf.train.steps * _measured_unit(conf) * _units_of_a_step(found, conf)
+    return conf.train.steps * _measured_unit(conf) * _units_of_a_step(placed, conf)
 
 
-def _units_of_a_step(found: _Found, conf: Conf) -> float:
+def _units_of_a_step(placed: _Placed, conf: Conf) -> float:
     from xrgs.sweep.estimate import units_of_a_step
 
-    return units_of_a_step(Store(conf.store), conf, found.variant_id)
+    return units_of_a_step(Store(conf.store), conf, placed.variant_id)
 
 
-def _say_end(found: _Found, conf: Conf, settings: Settings, seconds: float) -> None:
-    """Say in at most eight lines what was made, where it is, and what comes next."""
+def _say_end(placed: _Placed, conf: Conf, settings: Settings, seconds: float) -> None:
+    """Print the result, its page and the next commands, in at most eight lines."""
     from xrgs.report.page import PAGE
     from xrgs.sweep.ending import next_commands
 
     store, name = Store(conf.store), scenes.label(conf.scene)
-    cell = _cell(found, conf)
-    summary, report = cell.summary(), found.report
+    cell = _cell(placed, conf)
+    summary, report = cell.summary(), placed.report
     scores = [values["psnr"] for _, values in cell.view_scores()]
     unseen = "that it had not seen" if report.tests else "that it was trained on"
     took = f"{seconds / 60:.1f} min" + (f" of {settings.minutes:g} min" if settings.minutes else "")
@@ -288,7 +289,7 @@ def _say_end(found: _Found, conf: Conf, settings: Settings, seconds: float) -> N
     except StoreError:  # several cells of the scene are done
         word = cell.id[:8]
     say("Next:")
-    # Not the name of the video itself, which a film would replace.
+    # Not the name of the video itself: a film of that name would replace the video.
     file = f"{Path(name).stem}-scene" if conf.scene.kind == "video" else name
     commands = next_commands([word], file, store.path)
     if settings.out is not None:
@@ -297,10 +298,10 @@ def _say_end(found: _Found, conf: Conf, settings: Settings, seconds: float) -> N
         say(f"  {command}")
 
 
-def _cell(found: _Found, conf: Conf) -> CellFolder:
+def _cell(placed: _Placed, conf: Conf) -> CellFolder:
     from xrgs.store.identity import cell_id, cell_identity
 
-    return Store(conf.store).cell(cell_id(cell_identity(conf, found.variant_id)))
+    return Store(conf.store).cell(cell_id(cell_identity(conf, placed.variant_id)))
 
 
 def _kind(conf: Conf) -> str:

@@ -27,7 +27,7 @@ def view(
     Args:
         cells: One cell or two, each by its id, the beginning of its id, the name of a scene with
             one done cell, or a file: .ply, .glb or .spz.
-        port: Port of the page on 127.0.0.1; the next ones are used too. 0 takes any that is free.
+        port: Port of the page on 127.0.0.1; the next ones are used too. 0 takes any free ports.
         limit: The most Gaussians of a cell that are drawn: the most opaque ones.
         store: The store that has the cells.
     """

@@ -1,1 +1,1 @@
-"""Turns what people have into one plain folder: upright sRGB photographs, masks and lenses."""
+"""Turns users' photographs, videos and masks into upright sRGB images, masks and lenses."""

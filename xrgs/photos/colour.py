@@ -24,19 +24,21 @@ Samples = NDArray[Any]
 
 _INTENT = ImageCms.Intent.RELATIVE_COLORIMETRIC
 _BLACK_POINT = ImageCms.Flags.BLACKPOINTCOMPENSATION
-#: Without it, LittleCMS interpolates between 33 values, and is wrong by up to 14 of 255 at
-#: the gamut's edges; not for 8 bits of a matrix or of grey. With it, it takes ten times as long.
+#: Makes LittleCMS compute each colour, which takes ten times as long. Without this flag it
+#: interpolates in a table of 33 steps, and errs by up to 14 of 255 at the gamut's edges; 8-bit
+#: pixels of matrix profiles and of grey are exact in both cases.
 _EXACT = ImageCms.Flags.NOOPTIMIZE
-#: Pillow's mode of so many channels.
+#: Number of channels -> Pillow's mode.
 _MODES = {1: "L", 3: "RGB", 4: "CMYK"}
-#: The most that sRGB's own profiles, which round differently, change an 8-bit colour.
+#: The largest change of an 8-bit colour by a profile that counts as sRGB's: its copies round
+#: differently.
 _ROUNDING = 1
 
 Chromaticities = tuple[float, float, float, float, float, float, float, float]
 """x and y of white, red, green and blue, as in a PNG's cHRM."""
 SRGB: Chromaticities = (0.3127, 0.329, 0.64, 0.33, 0.3, 0.6, 0.15, 0.06)
 _ADOBE: Chromaticities = (0.3127, 0.329, 0.64, 0.33, 0.21, 0.71, 0.15, 0.06)
-#: Colour spaces by ITU-T H.273's number of their primaries, but for sRGB's own.
+#: ColourPrimaries of ITU-T H.273 -> name and chromaticities, without sRGB's.
 _H273_PRIMARIES: dict[int, tuple[str, Chromaticities]] = {
     4: ("BT.470 M", (0.31, 0.316, 0.67, 0.33, 0.21, 0.71, 0.14, 0.08)),
     5: ("BT.601 of 625 lines", (0.3127, 0.329, 0.64, 0.33, 0.29, 0.6, 0.15, 0.06)),
@@ -49,22 +51,23 @@ _H273_PRIMARIES: dict[int, tuple[str, Chromaticities]] = {
     12: ("Display P3", (0.3127, 0.329, 0.68, 0.32, 0.265, 0.69, 0.15, 0.06)),
     22: ("EBU Tech 3213", (0.3127, 0.329, 0.63, 0.34, 0.295, 0.605, 0.155, 0.077)),
 }
-#: H.273's numbers of sRGB's primaries, and those that stand for unknown ones.
+#: ColourPrimaries that are sRGB's (1), or that say that the primaries are unknown.
 _H273_SRGB_PRIMARIES = (0, 1, 2, 3)
-#: The curves of H.273 that are shown as sRGB's, which they differ from by little: those of cameras
-#: for BT.709 and its relatives, and sRGB's own. 0, 2 and 3 are unknown ones.
+#: Curves of H.273 that are decoded as sRGB's: its own, and the similar ones of cameras for BT.709
+#: and its relatives. 0, 2 and 3 say that the curve is unknown.
 _H273_SRGB = (0, 1, 2, 3, 6, 11, 12, 13, 14, 15)
-#: The curves of H.273 that are powers, by the exponent that decodes a value.
+#: Curves of H.273 that are powers -> the exponent that decodes a value.
 _H273_GAMMA = {4: 2.2, 5: 2.8, 8: 1.0}
 _H273_SMPTE_240M, _H273_SMPTE_428 = 7, 17
-#: Curves that no photograph for a screen has, and the reason why they are not converted.
+#: Curves of H.273 that are refused -> their names in messages.
 _H273_REFUSED = {
     9: "logarithmic brightness",
     10: "logarithmic brightness",
     16: "HDR (PQ)",
     18: "HDR (HLG)",
 }
-#: Differences in x and y, and of a curve's exponent in proportion, that are sRGB rounded.
+#: The largest difference in x or y, and the largest relative difference of the curve's exponent,
+#: at which a PNG's colours count as sRGB's, rounded.
 _SAME_XY, _SAME_GAMMA = 0.005, 0.05
 
 _BRADFORD = np.array(
@@ -85,26 +88,26 @@ class Encoding:
     gamma: float | None = None
     """The exponent that decodes a value; None is sRGB's curve."""
     smpte: int | None = None
-    """The number in H.273 of a curve of SMPTE's, 240M or ST 428-1, in place of `gamma`."""
+    """H.273's number of the curve SMPTE 240M or ST 428-1, which replaces `gamma`."""
     narrow_bits: int = 0
-    """The bits of values of narrow range, whose black is 16 and whose white 235 of 8 bits; 0 where
-    values have the full range."""
+    """Bits per value if values have video's narrow range (at 8 bits, black is 16 and white 235); 0
+    for the full range."""
 
 
 def from_h273(primaries: int, transfer: int, narrow_bits: int = 0) -> Encoding | None:
-    """Return the encoding of a HEIC file or of a PNG's cICP, by the numbers of ITU-T H.273.
+    """Return the colours that a HEIC file, a video or a PNG's cICP names by ITU-T H.273's numbers.
 
     Args:
         primaries: H.273's ColourPrimaries.
-        transfer: Its TransferCharacteristics.
+        transfer: H.273's TransferCharacteristics.
         narrow_bits: As in `Encoding`.
 
     Returns:
-        None where it is sRGB's of full range, or where the file says that it is not known.
+        None for full-range sRGB, or if the file says that its colours are unknown.
 
     Raises:
-        ColourError: The curve is that of HDR, which has no white to scale by, or a logarithm, or a
-            number is not known here.
+        ColourError: The curve is HDR, which has no white to scale by, or logarithmic; or a number
+            is unknown to this module.
     """
     if transfer in _H273_REFUSED:
         raise ColourError(f"its brightness is {_H273_REFUSED[transfer]}; save it as SDR")
@@ -125,12 +128,12 @@ def from_h273(primaries: int, transfer: int, narrow_bits: int = 0) -> Encoding |
 
 
 def adobe_rgb() -> Encoding:
-    """Return Adobe RGB (1998), which cameras name by EXIF's index `R03`, and some by number 2."""
+    """Return Adobe RGB (1998): index `R03` in EXIF, or colour space 2 from some cameras."""
     return Encoding("Adobe RGB", _ADOBE, 563 / 256)
 
 
 def from_png(gamma: float | None, chromaticities: Chromaticities | None) -> Encoding | None:
-    """Return the encoding of a PNG's gAMA and cHRM; None where it is about sRGB's or invalid."""
+    """Return the colours of a PNG's gAMA and cHRM; None if they are invalid or close to sRGB's."""
     xy = chromaticities or SRGB
     if np.abs(np.subtract(xy, SRGB)).max() < _SAME_XY or not _is_triangle(xy):
         xy = SRGB
@@ -140,7 +143,7 @@ def from_png(gamma: float | None, chromaticities: Chromaticities | None) -> Enco
 
 
 def _is_triangle(xy: Chromaticities) -> bool:
-    """Return whether the primaries span colours and the white is one."""
+    """Return whether the primaries span a triangle, and every y is above 0."""
     _, (ax, ay), (bx, by), (cx, cy) = zip(xy[::2], xy[1::2], strict=True)
     area = abs((bx - ax) * (cy - ay) - (cx - ax) * (by - ay)) / 2
     return min(xy[1::2]) > 0 and area > 0.01
@@ -152,13 +155,13 @@ def convert(
     """Convert the pixels of a photograph to sRGB.
 
     Args:
-        samples: Grey, RGB or CMYK [H, W, 1, 3 or 4]; uint8, or uint16 whose white is 65535. CMYK
-            has the largest value for full ink.
+        samples: Grey, RGB or CMYK [H, W, 1, 3 or 4]; uint8, or uint16 whose white is 65535. In
+            CMYK the largest value is full ink.
         profile: The file's ICC profile.
-        encoding: What the file says in place of a profile.
+        encoding: The colours that a file without a profile names.
 
     Returns:
-        RGB [H, W, 3] in 0..1, and what was done; empty where nothing was.
+        RGB [H, W, 3] in 0..1, and a note on the conversion, empty if there was none.
     """
     if profile:
         converted, note = _by_profile(samples, profile)
@@ -189,7 +192,7 @@ def _plain_rgb(samples: Samples) -> Samples:
 
 
 def _by_profile(samples: Samples, profile: bytes) -> tuple[Samples | None, str]:
-    """Convert by an ICC profile; None where it is sRGB's own or can't be used."""
+    """Convert by an ICC profile; None if the profile is sRGB's own or can't be used."""
     mode = _MODES[samples.shape[2]]
     transform, note = _transform(profile, mode)
     if transform is None:
@@ -214,8 +217,8 @@ def _by_profile(samples: Samples, profile: bytes) -> tuple[Samples | None, str]:
 def _transform(profile: bytes, mode: str) -> tuple[Any, str]:
     """Return Pillow's transform from a profile to sRGB and a note.
 
-    The transform is None where the profile is sRGB's own, is damaged, or is of another space than
-    the image.
+    The transform is None if the profile is sRGB's own, is damaged, or is for another colour space
+    than the image's.
     """
     try:
         source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
@@ -247,7 +250,7 @@ def _image(samples: Samples, mode: str) -> Image.Image:
 
 
 def _probe(mode: str) -> NDArray[np.uint8]:
-    """Return the colours of a grid, between which profiles are smooth: [1, N, 1 or 3]."""
+    """Return a grid of test colours [1, N, 1 or 3], between which profiles are smooth."""
     if mode == "L":
         return np.arange(256, dtype=np.uint8)[None, :, None]
     steps = np.linspace(0, 255, 17).astype(np.uint8)
@@ -286,7 +289,7 @@ def _linear(rgb: NDArray[np.float32], encoding: Encoding) -> NDArray[np.float32]
     linear: NDArray[np.float32]
     if encoding.smpte == _H273_SMPTE_240M:
         linear = np.where(rgb < 4 * 0.0228, rgb / 4, ((rgb + 0.1115) / 1.1115) ** (1 / 0.45))
-    elif encoding.smpte == _H273_SMPTE_428:  # of cinemas, whose white is 48 of 52.37 cd/m²
+    elif encoding.smpte == _H273_SMPTE_428:  # of cinemas: white has 48 cd/m², the most is 52.37
         linear = np.minimum(52.37 / 48 * rgb**2.6, 1)
     elif encoding.gamma is None:
         linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)

@@ -1,4 +1,4 @@
-"""Reads from EXIF and XMP which camera took a photograph, and what was done to its picture since.
+"""Reads from EXIF and XMP which camera took a photograph, and whether it was zoomed or cropped.
 
 Nothing here is sure: programs that crop, zoom or stitch may keep all tags as they were.
 """
@@ -16,17 +16,18 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 _MAKE, _MODEL = 0x010F, 0x0110
-_FOCAL, _FOCAL_35MM = 0x920A, 0xA405  # in mm; the latter of this field of view on 35 mm film
+_FOCAL, _FOCAL_35MM = 0x920A, 0xA405  # mm; the second is the 35 mm equivalent
 _DIGITAL_ZOOM, _CUSTOM_RENDERED = 0xA404, 0xA401
-_WIDTH, _HEIGHT = 0xA002, 0xA003  # of the picture as the camera saved it, px
-#: What Apple's cameras have in CustomRendered of a panorama.
+_WIDTH, _HEIGHT = 0xA002, 0xA003  # size of the picture as saved by the camera, px
+#: The value of CustomRendered by which Apple's cameras mark a panorama.
 _APPLE_PANORAMA = 6
-#: How far the aspect ratio of a picture may be from the one that EXIF has, for rounded sides.
+#: The largest relative deviation of a picture's aspect ratio from EXIF's, for rounded sides.
 _ASPECT_TOLERANCE = 0.01
-#: The projection in XMP, in Google's or any other namespace, and those of ordinary photographs.
+#: Finds the projection in XMP, in any namespace (Google's is GPano), and the values of ordinary
+#: photographs.
 _PROJECTION = re.compile(r":ProjectionType\s*(?:=\s*[\"']|>)\s*([^\"'<]*)")
 _PERSPECTIVE = ("", "none", "perspective", "rectilinear", "planar")
-#: The crop of Adobe's programs, in shares of the picture's sides.
+#: Find the crop that Adobe's programs write into XMP, as fractions of the picture's sides.
 _HAS_CROP = re.compile(r"crs:HasCrop\s*(?:=\s*[\"']|>)\s*true", re.IGNORECASE)
 _CROP = re.compile(r"crs:Crop(Top|Left|Bottom|Right|Angle)\s*(?:=\s*[\"']|>)\s*([-+.\d]+)")
 
@@ -36,18 +37,18 @@ class Taken:
     """How a photograph was taken, by its metadata."""
 
     camera: str = ""
-    """`make/model/focal length/35 mm equivalent`; empty where EXIF has none of them."""
+    """`make/model/focal length/35 mm equivalent`; empty if EXIF has none of them."""
     cut: str = ""
-    """What of its camera's field of view is shown, for a digital zoom or a crop: photographs of
-    which this differs have not the same camera. Empty where the metadata name neither."""
+    """The digital zoom and the crop that the metadata name; empty if they name neither.
+    Photographs that differ in it have different intrinsics."""
     focal_35mm: float | None = None
-    """The focal length for a film of 36 x 24 mm, mm."""
+    """The 35 mm equivalent focal length (film of 36 x 24 mm), mm."""
     projection: str = ""
-    """The projection of a panorama; empty of an ordinary photograph."""
+    """The projection of a panorama; empty for an ordinary photograph."""
 
 
 def read(path: Path) -> Taken:
-    """Read the metadata of a photograph; what is damaged in them is passed over.
+    """Read the metadata of a photograph; damaged entries are skipped.
 
     Raises:
         UnreadableError: The file can't be read now.
@@ -66,16 +67,16 @@ def read(path: Path) -> Taken:
 
 
 def _number(value: object) -> float | None:
-    """Return a number of EXIF, which may be a fraction without a denominator; None without one."""
+    """Convert a value of EXIF to a number; None if that fails, as for a fraction n / 0."""
     with suppress(Exception):
         return float(value)  # type: ignore[arg-type]
     return None
 
 
 def _cut(details: dict[int, Any], xmp: str, size: tuple[int, int]) -> str:
-    """Name the digital zoom and the crop of a photograph of a size, px."""
+    """Return `Taken.cut` of a photograph of this size, px."""
     parts = []
-    zoom = _number(details.get(_DIGITAL_ZOOM)) or 1.0  # 0 says that there was none
+    zoom = _number(details.get(_DIGITAL_ZOOM)) or 1.0  # 0 means no zoom
     if zoom > 1:
         parts.append(f"zoomed {zoom:.2f}")
     if _HAS_CROP.search(xmp) and (sides := sorted(_CROP.findall(xmp))):

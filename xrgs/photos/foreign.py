@@ -1,4 +1,4 @@
-"""Names the files of other programs that are given as poses, and says what to do with them."""
+"""Recognises files of other programs that users give as poses, for messages with advice."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 _AS_COLMAP = "export the cameras in COLMAP's format from the program that made it"
 _UNPACK = "unpack it, and give the folder"
 _FOLDER = "give the folder that it is in"
-#: What files are by the end of their names, in lower case, and what to do.
+#: End of a file's name, in lower case -> what the file is, and what to do with it.
 _ENDINGS = {
     **dict.fromkeys((".zip", ".7z", ".rar", ".tar", ".tgz", ".gz", ".xz"), ("an archive", _UNPACK)),
     ".xml": ("an .xml file, as Metashape's cameras are", _AS_COLMAP),
@@ -31,7 +31,7 @@ _ENDINGS = {
     ".ply": ("a file of points, which has no cameras", _FOLDER),
     **dict.fromkeys((".bin", ".txt"), ("one file", _FOLDER)),
 }
-#: Programs by a key of their .json files.
+#: A key of a .json file -> the program that writes it.
 _KEYS = {
     "sfm_data_version": "OpenMVG",
     "featuresFolders": "Meshroom",
@@ -41,15 +41,15 @@ _KEYS = {
 
 
 def kind(file: Path) -> str:
-    """Say what a file is by the end of its name; empty where it may be a transforms.json."""
+    """Describe a file by the end of its name, such as `an archive`; empty if the end is unknown."""
     return next((w for end, (w, _) in _ENDINGS.items() if file.name.lower().endswith(end)), "")
 
 
 def check_file(file: Path) -> None:
-    """Refuse a file that is no .json.
+    """Refuse a file that can't be a transforms.json, by the end of its name.
 
     Raises:
-        XrgsError: It is of another kind; the message names the kind, and says what to do.
+        XrgsError: The message says what the file is, and what to do.
     """
     for ending, (what, todo) in _ENDINGS.items():
         if file.name.lower().endswith(ending):
@@ -59,13 +59,13 @@ def check_file(file: Path) -> None:
 
 
 def in_folder(folder: Path) -> str:
-    """Say which files in a folder are of other programs; empty where there are none."""
+    """Name a folder's files of other programs, as the end of a message; empty if it has none."""
     endings = tuple(ending for ending in _ENDINGS if ending not in (".bin", ".txt", ".ply", ".csv"))
     found = [name for name in list_names(folder) if name.lower().endswith(endings)]
     return f"; {listed(found)} can't be read: {_AS_COLMAP}" if found else ""
 
 
 def of_json(content: Mapping[str, Any]) -> str:
-    """Name the program that wrote a .json; empty where it is not known."""
+    """Name the program that wrote a .json, as the end of a message; empty if it is unknown."""
     programs = [program for key, program in _KEYS.items() if key in content]
     return f": it is of {programs[0]}; {_AS_COLMAP}" if programs else ""

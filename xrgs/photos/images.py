@@ -1,11 +1,10 @@
 """Reads, resizes and saves photographs: float32 arrays [H, W, 3] in 0..1 in memory.
 
 Photographs of users are read upright by their EXIF orientation, and in sRGB by their ICC profile or
-the colours that they name. PNG, TIFF and HEIC keep all of their bits. HEIC needs pillow-heif, which
-is an extra. Of a file of
-several images the first is read (the primary one of HEIC, and of the JPEGs that phones write with
-gain maps or depth). The images of a store are PNGs of `save`, and are read by `read_png` alone.
-Nothing here imports torch before `resize` is called.
+the colours that they name. PNG, TIFF and HEIC keep all of their bits. HEIC needs pillow-heif (extra
+`heic`). Of a file with several images the first is read (the primary one of HEIC, and of the JPEGs
+that phones write with gain maps or depth). The images of a store are PNGs that `save` has written
+and `read_png` reads. Nothing here imports torch before `resize` is called.
 """
 
 from __future__ import annotations
@@ -34,9 +33,8 @@ if TYPE_CHECKING:
 
 ImageArray = NDArray[np.float32]  # [H, W, 3]
 
-#: The formats that are read. PIL goes by the content of a file and not by its suffix, and it hands
-#: some of the other formats that it knows to external programs. A TGA has no mark at its beginning,
-#: so that only its suffix tells it.
+#: The formats that are read, by a file's content: PIL hands some of the others to external
+#: programs. A TGA has no magic bytes, so that only its suffix tells it.
 _FORMATS = ("AVIF", "BMP", "HEIF", "JPEG", "JPEG2000", "PNG", "PPM", "TIFF", "WEBP")
 _TGA = frozenset({".tga"})
 #: The suffixes of HEIC files, in lower case.
@@ -50,45 +48,45 @@ SUFFIXES = (
     | {".mpo", ".pbm", ".pgm", ".pnm", ".ppm"}
     | _TGA
 )
-#: What the PNGs of this package have in their text chunk `Software`.
+#: The text chunk `Software` of the PNGs that this package writes.
 SOFTWARE = "xrgs"
-#: How files begin that people take for photographs of these formats, and what they are.
+#: First bytes -> format, of files that people take for photographs and that are not read.
 _OTHER_FORMATS = {
     b"\xff\x0a": "JPEG XL",
     b"\0\0\0\x0cJXL ": "JPEG XL",
     b"GIF8": "GIF",
     b"8BPS": "a Photoshop document",
 }
-#: What the files of a container have after their first four bytes, and which of them are AVIF.
+#: Bytes 4 to 7 of files in HEIF's container, and the brands (bytes 8 to 11) of AVIF.
 _HEIF_MAGIC, _AVIF_BRANDS = b"ftyp", (b"avif", b"avis")
-#: What follows it in photographs of this container, as films of it have other names there.
+#: The brands of photographs in this container; films in it have others.
 _HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1", *_AVIF_BRANDS)
-#: How files begin whose content tells that they are photographs. BMP and PPM begin with two letters
-#: as texts may, and raw files of cameras begin as TIFF does.
+#: First bytes that only photographs have. BMP and PPM begin with two letters, as texts may, and
+#: TIFF as cameras' raw files do.
 _PHOTOGRAPH_MAGIC = (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"\0\0\0\x0cjP  ")
-#: Where a JPEG 2000 and an AVIF file have the box of their colours, in bytes from the beginning.
+#: A JPEG 2000 or AVIF file has its colour box within this many first bytes.
 _BOXES_BYTES = 1 << 20
-#: The colours of JPEG 2000 by number: CMYK, sRGB, grey, and sRGB's YCC, which are decoded as such.
+#: The colour spaces of JPEG 2000 that are read: CMYK, sRGB, grey and sRGB's YCC.
 _JP2_COLOURS = (12, 16, 17, 18)
 _TIFF_MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 #: The chunks of a PNG that may hold EXIF or XMP.
 _PNG_TEXT = (b"eXIf", b"iTXt", b"tEXt", b"zTXt")
-#: The longest chunk that is kept, bytes: those of headers and colours are shorter.
+#: The longest chunk of a PNG that is kept, bytes: headers and colours are shorter.
 _SHORT_CHUNK = 64
 #: The channels of a PNG's colour types: grey, RGB, palette, grey with alpha, RGBA.
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
-#: The largest photograph that is read: cameras give 200 megapixels, and PIL takes 1 GB for this.
+#: The largest photograph that is read, px: cameras give 200 megapixels, and PIL takes 1 GB for it.
 MAX_PIXELS = 1 << 28
-#: The largest image of a store that is read. In training it takes 200 MB, and 2.4 GB more while a
-#: step compares a render with it.
+#: The largest image of a store that is read, px. In training it takes 200 MB, and 2.4 GB more while
+#: a step compares a render with it.
 MAX_PNG_PIXELS = 1 << 26
-#: Deflate, the compression of PNGs, makes at most 1032 bytes of one, and no photograph of any
-#: format shrinks as much. A drawing may; up to so many pixels it takes little memory.
+#: The most bytes of pixels per byte of a file: PNG's compression reaches 1032, and no photograph
+#: of any format comes near. A drawing may, and up to _SMALL_PIXELS it takes little memory.
 _MAX_EXPANSION, _SMALL_PIXELS = 1032, 1 << 24
-#: The fewest bits of a pixel in a file by PIL's modes, as masks and palettes have them; others 24.
+#: PIL's mode -> the fewest bits of a pixel before compression; 24 for other modes.
 _BITS = {"1": 1, "P": 1, "L": 8}
-#: With `scene.alpha=mask`, pixels of a lower alpha are outside. Our choice.
+#: With `scene.alpha=mask`, pixels with a lower alpha are masked out. Our choice.
 OPAQUE_FROM = 0.5
 _EXIF_ORIENTATION = 0x0112
 _EXIF_DETAILS, _EXIF_COLOUR_SPACE, _EXIF_INTEROPERABILITY = 0x8769, 0xA001, 0xA005
@@ -100,7 +98,7 @@ class ImageError(XrgsError):
 
 
 class _RefusedError(ValueError):
-    """A sound file that is not read; the message says why."""
+    """An intact file that can't be used; the message says why."""
 
 
 # PIL's limit holds for the whole process, and refuses photographs that `MAX_PIXELS` admits.
@@ -110,7 +108,7 @@ if Image.MAX_IMAGE_PIXELS is not None:
 
 @contextmanager
 def _stream(path: Path) -> Iterator[BinaryIO]:
-    """Open a file; every error of reading it as an image names it."""
+    """Open a file; errors of reading it as an image name the file."""
     try:
         with path.open("rb") as stream, warnings.catch_warnings():
             warnings.filterwarnings("ignore", module="PIL")  # they name no file
@@ -134,7 +132,7 @@ def _stream(path: Path) -> Iterator[BinaryIO]:
 
 
 def _unidentified(path: Path) -> str:
-    """Say what a file is that PIL can't identify."""
+    """Say why PIL can't identify a file."""
     if path.stat().st_size == 0:
         return "the file is empty"
     return f"cannot identify it as one of {', '.join(_FORMATS)}"
@@ -143,16 +141,16 @@ def _unidentified(path: Path) -> str:
 def _check_size(
     stream: BinaryIO, size: tuple[int, int], max_pixels: int, bits: int, *, drawing: bool = True
 ) -> None:
-    """Refuse an image that is too large, or that no file of these bytes can hold.
+    """Refuse an image that is too large, or that a file of so few bytes can't hold.
 
-    Its memory is not taken yet. A small `drawing` may compress without end.
+    It is called before memory for the pixels is taken.
 
     Args:
         stream: The file.
         size: Width and height, px.
         max_pixels: The most pixels that it may have.
-        bits: The bits of a pixel.
-        drawing: Whether it may be one.
+        bits: Bits per pixel before compression.
+        drawing: Whether it may be a drawing: a small one compresses without limit.
     """
     width, height = size
     if width * height > max_pixels:
@@ -168,7 +166,7 @@ def _check_size(
 
 
 def _formats(start: bytes, suffix: str) -> tuple[str, ...]:
-    """Return the formats that a file which begins so may have; HEIF is registered for HEIF."""
+    """Return the formats that PIL tries on a file with these first bytes; enable HEIF for HEIC."""
     for magic, name in _OTHER_FORMATS.items():
         if start.startswith(magic):
             raise _RefusedError(f"it is {name}, which is not read; convert it to PNG or JPEG")
@@ -188,7 +186,7 @@ def _formats(start: bytes, suffix: str) -> tuple[str, ...]:
 
 
 def is_photograph(path: Path) -> bool | None:
-    """Tell from the first bytes of a file without an image's suffix whether it is a photograph.
+    """Return whether a file without an image's suffix is a photograph, by its first bytes.
 
     Returns:
         None where it may be an image of a format that is not read.
@@ -207,17 +205,17 @@ def is_photograph(path: Path) -> bool | None:
 
 @dataclass(frozen=True)
 class Header:
-    """What a file says of its photograph before the pixels are decoded."""
+    """Size and depth of a photograph, as read before the pixels are decoded."""
 
     size: tuple[int, int]
     """Width and height with the EXIF orientation applied, px."""
     orientation: int
-    """The EXIF orientation that is applied, 1 to 8; 1 where the tag is missing or invalid. It is 1
-    of HEIC, which has its own transformations."""
+    """The EXIF orientation that is applied, 1 to 8; 1 if the tag is missing or invalid, and for
+    HEIC, whose decoder turns the pixels."""
     channels: int
-    """How many values a pixel has; 1 also of a palette's."""
+    """Values per pixel; 1 for a palette."""
     bits: int
-    """How many bits a value has."""
+    """Bits per value."""
 
     @property
     def is_deep_grey(self) -> bool:
@@ -236,12 +234,12 @@ class Picture:
     orientation: int
     """The EXIF orientation that was applied, as in `Header`."""
     notes: tuple[str, ...]
-    """What was done to it, as in `converted from Display P3 to sRGB`."""
+    """What was converted or ignored, such as `converted from Display P3 to sRGB`."""
 
 
 @dataclass
 class _Samples:
-    """The pixels of a file, as `Picture` has them but for colour and orientation."""
+    """The decoded pixels of a file, before they are converted to sRGB and turned upright."""
 
     colours: NDArray[np.uint8] | NDArray[np.uint16]
     """[H, W, 1, 3 or 4]: grey, RGB or CMYK."""
@@ -264,14 +262,14 @@ class _File(Protocol):
 
     @property
     def xmp(self) -> str:
-        """Return the XMP of the file, empty where it has none."""
+        """Return the XMP of the file; empty if it has none."""
 
     @property
     def frames(self) -> int:
-        """Return how many images the file has, but for those that belong to one."""
+        """Return the number of images in the file, without a JPEG's gain maps and depth."""
 
     def encoding(self) -> colour.Encoding | None:
-        """Return the colours that the file names in place of an ICC profile."""
+        """Return the colours that a file without an ICC profile names."""
 
     def load(self) -> _Samples:
         """Decode the pixels."""
@@ -294,7 +292,7 @@ class _PilFile:
         deep_bits = self.channels * self.bits if self.bits > 8 else 0
         _check_size(stream, image.size, MAX_PIXELS, deep_bits or _BITS.get(image.mode, 24))
         self.profile: bytes | None = image.info.get("icc_profile")
-        if b"cICP" in self._chunks:  # PNG's third edition puts it above the profile
+        if b"cICP" in self._chunks:  # it overrides the profile (PNG, third edition)
             self.profile = None
         has_box = image.format in ("AVIF", "JPEG2000")
         self._box = _colour_box(stream, image.format == "AVIF") if has_box else b""
@@ -302,9 +300,9 @@ class _PilFile:
             self.profile = self._box[3:]
         self.exif = Image.Exif()
         with suppress(Exception):  # PIL raises nearly anything on damaged EXIF
-            # A PNG's own method decodes the pixels, to look for EXIF behind them.
+            # The method of PNGs decodes the pixels, to find EXIF behind them.
             self.exif = image.getexif() if has_late_exif else Image.Image.getexif(image)
-        # TIFFs are turned when they are loaded, and say so before; a HEIC file's tag is no order.
+        # PIL turns a TIFF on loading, and gives its turned size; HEIC's decoder ignores the tag.
         self.orientation = 1 if is_heif else _orientation(self.exif.get(_EXIF_ORIENTATION))
         self.size = image.size
         if image.format == "TIFF":
@@ -317,7 +315,7 @@ class _PilFile:
 
     @property
     def frames(self) -> int:
-        # The others of a JPEG are gain maps, depth, or the other half of a stereo pair.
+        # Further images of a JPEG are gain maps, depth, or the other half of a stereo pair.
         is_jpeg = self.image.format in ("JPEG", "MPO")
         return 1 if is_jpeg else getattr(self.image, "n_frames", 1)
 
@@ -338,14 +336,14 @@ class _PilFile:
             return colour.from_h273(
                 int(nclx["color_primaries"]), int(nclx["transfer_characteristics"])
             )
-        if self._box[:4] == b"nclx":  # of AVIF; its range is that of the decoder's input
+        if self._box[:4] == b"nclx":  # of AVIF, whose decoder has applied the range
             primaries, transfer = struct.unpack_from(">HH", self._box, 4)
             return colour.from_h273(primaries, transfer)
         if self._box[:1] == b"\1":
             (number,) = struct.unpack_from(">I", self._box, 3)
             if number not in _JP2_COLOURS:
                 raise colour.ColourError(f"colours of kind {number} of JPEG 2000 are not read")
-        with suppress(Exception):  # as for EXIF itself
+        with suppress(Exception):  # PIL raises nearly anything on damaged EXIF
             interoperability = self.exif.get_ifd(_EXIF_INTEROPERABILITY).get(1, "")
             space = self.exif.get_ifd(_EXIF_DETAILS).get(_EXIF_COLOUR_SPACE)
             if interoperability.startswith("R03") or space == 2:
@@ -368,7 +366,7 @@ class _PilFile:
         image.load()
         upright = image.format in ("HEIF", "TIFF")
         if image.mode == "LAB":
-            self.profile = None  # it is of LAB, and so is the conversion
+            self.profile = None  # it describes LAB, which `from_lab` converts
             return _Samples(colour.from_lab(image), None, "converted from CIELAB to sRGB", upright)
         if image.has_transparency_data:
             # PIL converts premultiplied colours (La, RGBa) and palettes with alpha.
@@ -427,7 +425,7 @@ def _file(stream: BinaryIO, path: Path) -> _File:
 
 
 def _colour_box(stream: BinaryIO, is_avif: bool) -> bytes:
-    """Return what the box of colours of a JPEG 2000 or AVIF file has; empty where there is none."""
+    """Return the content of a JPEG 2000 or AVIF file's colour box; empty if it has none."""
     stream.seek(0)
     start = stream.read(_BOXES_BYTES)
     at = start.find(b"colrnclx" if is_avif else b"colr")
@@ -437,7 +435,7 @@ def _colour_box(stream: BinaryIO, is_avif: bool) -> bytes:
 
 
 def _png_chunks(stream: BinaryIO) -> tuple[dict[bytes, bytes], bool]:
-    """Read the short chunks of a PNG by name, and whether EXIF or text is behind the pixels."""
+    """Return the short chunks of a PNG by name, and whether EXIF or text follows the pixels."""
     chunks: dict[bytes, bytes] = {}
     is_late = False
     stream.seek(len(_PNG_MAGIC))
@@ -453,13 +451,13 @@ def _png_chunks(stream: BinaryIO) -> tuple[dict[bytes, bytes], bool]:
 
 
 def _orientation(value: object) -> int:
-    """Return an EXIF orientation; 1 for all that is no number of 1 to 8."""
+    """Return an EXIF orientation, 1 to 8; 1 for any other value."""
     return int(value) if value in range(1, 9) else 1  # type: ignore[call-overload]
 
 
 def turned(array: NDArray[Any], orientation: int) -> NDArray[Any]:
     """Turn an array [H, W, ...] upright by its EXIF orientation."""
-    if orientation >= 5:  # 5 to 8 are mirrored at the diagonal, then as 1, 2, 4 and 3
+    if orientation >= 5:  # 5 to 8 are mirrored at the diagonal, then treated as 1 to 4
         array = array.swapaxes(0, 1)
     if orientation in (2, 3, 6, 7):
         array = array[:, ::-1]
@@ -469,7 +467,7 @@ def turned(array: NDArray[Any], orientation: int) -> NDArray[Any]:
 
 
 def turned_size(size: tuple[int, int], orientation: int) -> tuple[int, int]:
-    """Return width and height as EXIF turns stored pixels, or back: 5 to 8 exchange the two."""
+    """Return width and height after EXIF's turn, or before it: 5 to 8 exchange the two."""
     return size[::-1] if orientation >= 5 else size
 
 
@@ -490,7 +488,7 @@ def _header(file: _File) -> Header:
 
 
 def size(path: Path) -> tuple[int, int]:
-    """Return the width and height of a photograph, px, as `header` does."""
+    """Return the upright width and height of a photograph, px; raises as `header` does."""
     return header(path).size
 
 
@@ -542,7 +540,7 @@ def _small(image: Image.Image, side: int) -> NDArray[np.uint8]:
 
 
 def metadata(path: Path) -> tuple[Image.Exif, dict[int, Any], str]:
-    """Read EXIF of a photograph, the tags of how it was taken, and XMP; empty where it has none.
+    """Read a photograph's EXIF, its sub-directory on the exposure, and XMP; empty if absent.
 
     Raises:
         UnreadableError: The file can't be read now.
@@ -556,7 +554,7 @@ def metadata(path: Path) -> tuple[Image.Exif, dict[int, Any], str]:
 
 
 def decode(path: Path) -> Picture:
-    """Decode a photograph: upright, in sRGB, with alpha apart. 8-bit sRGB values are over 255.
+    """Decode a photograph: upright, in sRGB 0..1 (8-bit values / 255), with separate alpha.
 
     Raises:
         UnreadableError: The file can't be read now.
@@ -670,7 +668,7 @@ def save(path: Path, image: ImageArray, *, durable: bool = True) -> None:
     """Write an 8-bit RGB PNG, clamped to 0..1 and rounded to nearest.
 
     Args:
-        path: The file, which is replaced atomically; its folder is made in an existing one.
+        path: The file, which is replaced atomically; its folder is made, but no parents of it.
         image: [H, W, 3].
         durable: As for `atomic_writer`.
     """

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
     from xrgs.photos.images import ImageArray
 
-#: The parameters of COLMAP's camera models, whose numbers in binary files count from 0 in this
-#: order. Beside the focal length and the principal point they are terms of distortion.
+#: COLMAP's camera models -> their parameters: focal length, principal point, terms of distortion.
+#: The models' numbers in binary files count from 0 in this order.
 MODELS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
     "PINHOLE": ("fx", "fy", "cx", "cy"),
@@ -53,17 +53,17 @@ _PERSPECTIVE = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_DIVI
 #: The angle from the optical axis to a side of the undistorted image is at most 60 degrees: beyond,
 #: a pinhole camera stretches the picture more than 4 times, 1 / cos², and shrinks its centre.
 _MAX_TANGENT = np.tan(np.radians(60.0))
-#: The longest focal length of an undistorted image, over the focal length of the photograph.
+#: The largest ratio of the undistorted image's focal length to the photograph's.
 _MAX_ZOOM = 8.0
-#: The shortest focal length of a camera, over the longer side of its image, and the largest value
-#: of a parameter: no camera comes near them, and powers of such numbers stay finite.
+#: The least ratio of focal length to the image's longer side, and the largest parameter: no camera
+#: comes near them, and powers of such numbers stay finite.
 _LEAST_FOCAL, _MAX_VALUE = 1e-3, 1e9
 _Row = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class Lens:
-    """The camera of an image: a camera of COLMAP, and where its pixels are in the image.
+    """The camera of an image: COLMAP's camera, and the map from its pixels to the image's.
 
     The image may have been turned by quarters, resized and cropped since COLMAP saw it. Pixel
     centres are at +0.5.
@@ -96,7 +96,7 @@ class Lens:
         return K
 
     def resized(self, width: int, height: int) -> Lens:
-        """Return the camera of the same image after it was resized; its rays are the same."""
+        """Return the camera of the image after it is resized to this size, px."""
         scale = np.diag([width / self.width, height / self.height])
         return self._moved(scale, np.zeros(2), (width, height))
 
@@ -105,9 +105,9 @@ class Lens:
         return self._moved(np.eye(2), np.array([-left, -top], np.float64), (width, height))
 
     def turned(self, quarters: int) -> Lens:
-        """Return the camera of the image after it was turned clockwise by 1, 2 or 3 quarters.
+        """Return the camera of the image after 1, 2 or 3 quarter turns clockwise.
 
-        A ray (x, y, 1) of this camera is (R (x, y), 1) of the new one, with R of `quarter_turn`.
+        A ray (x, y, 1) of this camera is (R (x, y), 1) of the new one, R = quarter_turn(quarters).
         """
         R, size = quarter_turn(quarters), np.array([self.width, self.height])
         shift = -np.minimum(R @ size, 0)  # the turned image begins at 0 again
@@ -145,7 +145,7 @@ class Lens:
             rays: Points [N, 2] on the plane z = 1, in the axes of the image.
 
         Returns:
-            Pixels [N, 2] of the image; NaN where the camera model projects no such ray.
+            Pixels [N, 2] of the image; NaN for a ray that the camera model can't project.
         """
         import zlib  # noqa: F401  pycolmap 4.2.1 corrupts the heap where it is imported before zlib
 
@@ -165,7 +165,7 @@ class Lens:
     def _moved(
         self, linear: NDArray[np.float64], shift: NDArray[np.float64], size: tuple[int, int]
     ) -> Lens:
-        """Return the camera after the pixels of the image were mapped."""
+        """Return the camera after pixels x of the image become linear @ x + shift."""
         own, own_shift = self._affine()
         rows = np.concatenate([linear @ own, (linear @ own_shift + shift)[:, None]], axis=1)
         (a, b, c), (d, e, f) = (rows + 0.0).tolist()  # + 0.0: no negative zeros
@@ -173,7 +173,7 @@ class Lens:
 
 
 def lens_of_model(model: str, size: tuple[int, int], params: Sequence[float]) -> Lens:
-    """Convert a camera of COLMAP.
+    """Make the lens of COLMAP's camera; a model whose distortion is 0 becomes PINHOLE.
 
     Args:
         model: The name of COLMAP's camera model.
@@ -181,7 +181,7 @@ def lens_of_model(model: str, size: tuple[int, int], params: Sequence[float]) ->
         params: The model's parameters, in COLMAP's order.
 
     Raises:
-        XrgsError: The model is not served, or a value is out of its range.
+        XrgsError: The model is not supported, or a value is out of its range.
     """
     if model == "EQUIRECTANGULAR":
         raise XrgsError(
@@ -215,7 +215,7 @@ def lens_of_model(model: str, size: tuple[int, int], params: Sequence[float]) ->
 
 
 def quarter_turn(quarters: int) -> NDArray[np.float64]:
-    """Return the rotation [2, 2] of pixels when an image is turned clockwise by quarters."""
+    """Return the rotation [2, 2] of pixel positions by clockwise quarter turns of the image."""
     return np.linalg.matrix_power(np.array([[0.0, -1.0], [1.0, 0.0]]), quarters)
 
 
@@ -262,10 +262,9 @@ def _border(lens: Lens) -> NDArray[np.float64]:
 
 @cache
 def _zoom(lens: Lens) -> float:
-    """Find the focal length of the undistorted image, over the focal length of the photograph.
+    """Find the ratio of the undistorted image's focal length to the photograph's.
 
-    It depends on the border of the image alone, so that an image and its resized copy are zoomed
-    alike.
+    It depends only on the border of the image, so that resized copies get the same ratio.
     """
     rays = _rays(_border(lens), lens.K)
     low, high = float(np.abs(rays).max() / _MAX_TANGENT), _MAX_ZOOM
@@ -284,7 +283,7 @@ def _zoom(lens: Lens) -> float:
 
 
 def _fills(lens: Lens, rays: NDArray[np.float64]) -> bool:
-    """Return whether all inside a border of rays [N, 2] has a source inside the photograph."""
+    """Return whether every ray inside a border of rays [N, 2] falls into the photograph."""
     steps = np.append(np.linspace(0, 1, 9), 1.001)  # from the axis to the border, and just beyond
     path = lens.project((steps[:, None, None] * rays).reshape(-1, 2)).reshape(len(steps), -1, 2)
     # Where the radius falls on the way out, the lens would fold the image.

@@ -1,7 +1,7 @@
 """Finds the masks of photographs, and brings them to the sizes of the views.
 
-A mask is an image in which white is used and black is not, as in COLMAP. A pixel of a resized or
-undistorted view is used if nearly all pixels that it is made of are used.
+A mask is an image in which white pixels are used and black ones are not, as in COLMAP. A pixel of a
+resized or undistorted view is used if nearly all of its source pixels are used.
 """
 
 from __future__ import annotations
@@ -30,20 +30,21 @@ if TYPE_CHECKING:
 Mask = NDArray[np.bool_]  # [H, W], True for a pixel that is used
 
 _T = TypeVar("_T", np.float32, np.uint8)
-#: The folder of the masks of copies.
+#: The folder of masks in a folder of copies, as COLMAP expects it.
 MASKS = "masks"
-#: What programs call masks, in names of files and folders.
+#: Words for masks in names of files and folders.
 WORDS = r"masks?|segmentations?|seg|segments|mattes?|silhouettes?"
-#: What programs write before or after the name of the photograph.
+#: The words before or after the photograph's name in the name of its mask.
 _AFFIX = re.compile(rf"^(?:{WORDS}|alpha)[\W_]|[\W_](?:{WORDS}|alpha)$", re.IGNORECASE)
 #: The brightness from which a pixel of a mask is white: half-way to black.
 _WHITE = 0.5
-#: The brightness of 1 in an 8-bit mask, in which programs that write labels have 0 and 1.
+#: The brightness of the 8-bit value 1: some programs write masks as labels 0 and 1.
 _LABEL = 1 / 255
-#: A mask of which more than this share is neither black nor white may be another picture.
+#: A mask may be another picture if more than this share of its pixels is neither black (brightness
+#: below _BLACK_BELOW) nor white (above 1 - _BLACK_BELOW).
 _MOST_BETWEEN, _BLACK_BELOW = 0.05, 0.1
 _GREY = "masks that are not black and white, of which what is brighter than grey is used"
-#: A pixel is used if at least this share of what it is made of is used.
+#: A resampled pixel is used if at least this share of its source is used.
 _NEARLY_ALL = 0.99
 
 
@@ -51,12 +52,12 @@ def find(folder: str, photographs: Mapping[str, Path]) -> tuple[dict[str, Path],
     """Find the masks of photographs in a folder and all folders below it.
 
     The mask of `IMG_1.jpg` is `IMG_1` with the suffix of any image, `IMG_1.jpg.png`, or one of
-    these with `mask` before or after the name. Folders come before the name as in the names of
-    photographs. Small and capital letters are the same.
+    these with `mask` before or after the name. The names of its folders come before its name, as
+    for photographs. Case is ignored.
 
     Args:
         folder: `scene.masks`.
-        photographs: The photographs by name. They may lie in the folder, and are no masks.
+        photographs: The photographs by name. If they lie in the folder, they are skipped.
 
     Returns:
         The masks by the names of the photographs, and sentences on photographs without a mask and
@@ -115,7 +116,7 @@ def _images_below(root: Path) -> list[Path]:
 
 
 def _keys(inside: Path) -> Iterator[str]:
-    """Yield the keys of the names of the photographs that a file may be the mask of."""
+    """Yield the keys (see `_key`) of photographs whose mask may have this path."""
     for stem in dict.fromkeys((inside.stem, _AFFIX.sub("", inside.stem))):
         yield _key("_".join([*inside.parent.parts, stem]))
         if Path(stem).suffix.lower() in images.SUFFIXES:
@@ -128,24 +129,24 @@ def _key(name: str) -> str:
 
 @dataclass(frozen=True)
 class Masks:
-    """The masks of photographs, and how each of them lies on its photograph."""
+    """The masks of photographs, and which of them EXIF's orientation must turn."""
 
     files: Mapping[str, Path]
     """The masks by the names of the photographs."""
     turned: frozenset[str]
-    """The photographs whose masks are of the stored pixels, and are turned by EXIF as these are."""
+    """Names of the photographs whose masks match the stored pixels, and are turned with them."""
     notes: tuple[str, ...]
-    """A sentence on masks that fit both ways."""
+    """A sentence on masks that fit both turned and not turned."""
 
     @classmethod
     def fitted(cls, files: Mapping[str, Path], headers: Mapping[str, Header]) -> Masks:
-        """Decide whether masks were made of the photographs as stored, or as they are seen.
+        """Decide for each mask whether it matches its photograph as stored, or turned by EXIF.
 
-        A mask that has the shape of one alone decides for itself, and for the masks of the same
-        folder that fit both ways: of photographs that EXIF turns by 180 degrees, or square ones.
+        The shape decides. Square photographs and those turned by 180 degrees fit both ways; their
+        masks follow the others of the folder.
 
         Args:
-            files: The masks by the names of the photographs; others than in `headers` are left out.
+            files: The masks by the names of the photographs; names not in `headers` are left out.
             headers: The headers of the photographs.
 
         Raises:
@@ -170,7 +171,7 @@ class Masks:
             if not fits_seen:
                 stored.add(name)
             elif mask.orientation > 1 or not _same_shape(mask.size, as_stored):
-                seen.add(name)  # a mask with a tag of its own has been turned by it
+                seen.add(name)  # the mask's own EXIF orientation turns it
             else:
                 either.add(name)
         notes = []
@@ -187,8 +188,8 @@ class Masks:
         """Read the mask of a photograph.
 
         Returns:
-            The mask at the photograph's size, None where it has none, and what is to be said of it:
-            empty for a black and white one.
+            The mask [H, W] at the photograph's size, None if there is none; and a note, empty for a
+            black and white mask.
 
         Raises:
             UnreadableError: The mask can't be read now.
@@ -214,12 +215,12 @@ class Masks:
 
 
 def copy_mask(folder: Path, file: str) -> Path:
-    """Return the file of the mask of a copy in a folder, which is where COLMAP looks for it."""
+    """Return the path of the mask of the copy `folder/file`, where COLMAP looks for it."""
     return folder / MASKS / f"{file}.png"
 
 
 def _same_shape(one: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Return whether one size is the other at another scale, up to the rounding of a side."""
+    """Return whether two sizes have the same aspect ratio, up to the rounding of a side."""
     (w, h), (width, height) = one, other
     return abs(h - height * w / width) < 1 or abs(w - width * h / height) < 1
 
@@ -229,7 +230,7 @@ def resized(mask: Mask, width: int, height: int) -> Mask: ...
 @overload
 def resized(mask: None, width: int, height: int) -> None: ...
 def resized(mask: Mask | None, width: int, height: int) -> Mask | None:
-    """Resize a mask: a pixel is used if nearly all pixels that it is made of are used."""
+    """Resize a mask [H, W]: a pixel is used if nearly all of its source pixels are used."""
     if mask is None or mask.shape == (height, width):
         return mask
     import torch
@@ -244,7 +245,7 @@ def resized(mask: Mask | None, width: int, height: int) -> Mask | None:
 def degraded(mask: Mask | None, size: tuple[int, int], factor: int) -> Mask | None:
     """Return the mask of an LR view of `size` (height, width), from the mask of its HR view.
 
-    A view that keeps its size may have been brought down by `factor` and up again.
+    The mask is reduced by `factor` and enlarged to `size`, as a view is that keeps its size.
     """
     if mask is None:
         return None
@@ -263,14 +264,14 @@ def undistorted(mask: Mask, lens: Lens) -> Mask:
 def filled(image: NDArray[_T], mask: Mask | None) -> NDArray[_T]:
     """Give each pixel that is not used the colour of the nearest used one.
 
-    What is hidden then reaches no used pixel by resampling, and no window of SSIM.
+    Hidden content then reaches no used pixel by resampling, and no window of SSIM.
 
     Args:
         image: [H, W, 3].
         mask: [H, W]; None uses all pixels.
 
     Returns:
-        [H, W, 3]; the image itself where all or none of its pixels are used.
+        [H, W, 3]; the image itself if all or none of its pixels are used.
     """
     if mask is None or not mask.any():
         return image

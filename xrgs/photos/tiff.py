@@ -1,8 +1,8 @@
 """Decodes images of more than 8 bits per channel, which Pillow cuts to 8: PNG, TIFF and HEIC.
 
-Values are scaled to 16 bits: the largest that the file's depth admits becomes 65535. Files whose
-values use the low bits of 16 alone, as raw sensor data of 12 bits does, are refused, unless the
-file says how many bits are significant (PNG's sBIT, TIFF's MaxSampleValue).
+Values are scaled to 16 bits: the largest that the file's depth admits becomes 65535. 16-bit files
+that use only the low bits, such as raw 12-bit sensor data, are refused, unless they say how many
+bits are significant (PNG's sBIT, TIFF's MaxSampleValue).
 """
 
 from __future__ import annotations
@@ -18,14 +18,15 @@ if TYPE_CHECKING:
     from typing import BinaryIO
 
 _WHITE = 65535
-#: Where no value of 16 bits is larger, 14 bits or fewer are used, as cameras' sensors have.
+#: If no 16-bit value is larger, the file uses 14 bits or fewer, like cameras' sensors.
 _LARGEST_OF_14_BITS = (1 << 14) - 1
 _MAX_SAMPLE_VALUE = 281
-#: TIFF's photometric interpretations that are read: white is zero, black is zero, RGB, CMYK.
+#: TIFF's photometric interpretations that are read (white is zero, black is zero, RGB, CMYK) and
+#: their number of channels.
 _MIN_IS_WHITE, _MIN_IS_BLACK, _RGB, _CMYK = 0, 1, 2, 5
 _COLOURS = {_MIN_IS_WHITE: 1, _MIN_IS_BLACK: 1, _RGB: 3, _CMYK: 4}
-_UNSPECIFIED, _ASSOCIATED = 0, 1  # of TIFF's ExtraSamples; alpha is straight otherwise
-_SIGNED, _FLOAT = 2, 3  # of TIFF's SampleFormat
+_UNSPECIFIED, _ASSOCIATED = 0, 1  # TIFF's ExtraSamples: no alpha, premultiplied alpha
+_SIGNED, _FLOAT = 2, 3  # TIFF's SampleFormat
 
 
 class DepthError(ValueError):
@@ -44,7 +45,7 @@ class DeepPixels:
 
 
 def decode_png(content: bytes, significant: int) -> DeepPixels:
-    """Decode a PNG of 16 bits; `significant` is the largest number of its sBIT, or 16."""
+    """Decode a 16-bit PNG; `significant` is the largest number of bits in its sBIT, else 16."""
     import imagecodecs
 
     samples: NDArray[np.uint16] = imagecodecs.png_decode(content)
@@ -58,7 +59,7 @@ def decode_png(content: bytes, significant: int) -> DeepPixels:
 
 
 def of_grey(samples: NDArray[Any]) -> DeepPixels:
-    """Take grey samples [H, W] of 16 bits, as Pillow decodes them."""
+    """Convert 16-bit grey samples [H, W] that Pillow has decoded."""
     return DeepPixels(_scaled(samples[..., None], _WHITE, _WHITE)[0], None)
 
 
@@ -85,7 +86,7 @@ class Tiff:
         """Read its tags; the stream must stay open."""
         import tifffile
 
-        # Its warnings are of tags, and would reach the terminal.
+        # Its warnings of odd tags would reach the terminal.
         logging.getLogger("tifffile").addHandler(logging.NullHandler())
         self._pages = tifffile.TiffFile(stream).pages
         self._page: tifffile.TiffPage = self._pages.first
@@ -93,33 +94,33 @@ class Tiff:
 
     @property
     def is_deep(self) -> bool:
-        """Whether Pillow can't be trusted with it: more than 8 bits, signed or float."""
+        """Whether Pillow may lose values: they have more than 8 bits, are signed or float."""
         return self.bits > 8 or self._page.sampleformat in (_SIGNED, _FLOAT)
 
     @property
     def note(self) -> str:
-        """A word where a channel is ignored that may be alpha."""
+        """A note if a fourth channel, perhaps alpha, is ignored; else empty."""
         ignored = self.extra == _UNSPECIFIED
         return "a channel ignored, which the file does not call alpha" if ignored else ""
 
     @property
     def bits(self) -> int:
-        """How many bits a sample has."""
+        """Bits per sample."""
         return int(self._page.bitspersample)
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height, not turned, px."""
+        """Width and height as stored, before EXIF's turn, px."""
         return self._page.imagewidth, self._page.imagelength
 
     @property
     def channels(self) -> int:
-        """The number of samples of a pixel."""
+        """Samples per pixel."""
         return int(self._page.samplesperpixel)
 
     @property
     def extra(self) -> int | None:
-        """What the first channel beside the colours is; None where the file doesn't say."""
+        """ExtraSamples of the first channel after the colours; None if the file doesn't say."""
         return next((int(kind) for kind in self._page.extrasamples), None)
 
     @property
@@ -132,11 +133,11 @@ class Tiff:
         return self._page.tags.valueof(tag, default=default)
 
     def decode(self) -> DeepPixels:
-        """Decode the pixels, not turned.
+        """Decode the pixels as stored, before EXIF's turn.
 
         Raises:
-            DepthError: Its values are float, signed or of more than 16 bits, or its colours of
-                another kind than grey, RGB and CMYK.
+            DepthError: Values are float, signed or of more than 16 bits, or colours are not grey,
+                RGB or CMYK.
         """
         page = self._page
         bits, photometric = self.bits, int(page.photometric)
@@ -179,7 +180,7 @@ def _unmultiplied(
 
 
 def _scaled(colours: NDArray[Any], white: int, largest: int) -> tuple[NDArray[np.uint16], str]:
-    """Scale values to 65535, from `white` or from the `largest` that the file declares."""
+    """Scale values so that `white`, or the file's declared `largest`, is 65535; return a note."""
     most = int(colours.max())
     note = ""
     if white == _WHITE and most <= _LARGEST_OF_14_BITS:

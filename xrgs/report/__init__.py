@@ -1,4 +1,4 @@
-"""Tables and figures of a sweep, made from its store alone, without training and without torch."""
+"""Makes tables and figures of a sweep, only from its store: without training, without torch."""
 
 from xrgs.report.compare import Design
 from xrgs.report.joined import Choice

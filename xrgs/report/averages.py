@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 _SCENE = ["label", "condition", "scene", "metric"]
 _MEAN = ["label", "condition", "metric"]
-#: Columns that are computed in the scale of the effect, and shown in percent where it is a log.
+#: Columns in the unit of the effect, which are shown in percent if the effect is a logarithm.
 _EFFECTS = [
     *("change", "low", "high", "new_low", "new_high"),
     *("scatter_replicates", "scatter_scenes"),
@@ -31,22 +31,22 @@ def averaged(pairs: pd.DataFrame, ratios: Collection[str]) -> tuple[pd.DataFrame
     Args:
         pairs: One row for each metric of each pair: `label`, `condition`, `scene`, `metric`,
             `base`, `value`, `effect`, and `why` there is no effect.
-        ratios: Names of the metrics with the logarithm of a ratio as their effect.
+        ratios: Names of the metrics whose effect is the logarithm of a ratio.
 
     Returns:
         Two tables, indexed by label, condition, scene, metric, and by label, condition, metric.
 
         `base` and `value` are means over the pairs that have an effect. `effect` and `spread` are
-        mean and standard deviation of `n` values of the kind `unit`: of the means of `scenes`, or
-        of `replicates` where there is one scene. `up` and `down` of them are above and below 0.
-        `scenes` and `pairs` count what has an effect, and `why` says why some have none.
+        mean and standard deviation of `n` values. `unit` says which: `scenes`, the scenes' means,
+        or `replicates` if there is one scene. `up` and `down` count values above and below 0.
+        `scenes` and `pairs` count those with an effect, and `why` says why others have none.
 
         `change` is the effect, with its 95 % interval `low` to `high`; `new_low` to `new_high` is
         the interval for one more scene. `scatter_replicates` (pooled within scenes) and
         `scatter_scenes` (of the scenes' means) are standard deviations. All of them are in percent
         for `ratios`: 100 (exp(x) - 1).
 
-        `p` is that of the t-test that belongs to the interval, `p_sign` that of the sign test.
+        `p` belongs to the t-test of the interval, `p_sign` to the sign test.
     """
     scenes = _means(pairs, _SCENE)
     scenes = scenes.assign(
@@ -65,10 +65,10 @@ def _means(rows: pd.DataFrame, by: list[str]) -> pd.DataFrame:
 
     Rows without an effect are left out of every mean; `why` says why they have none.
     """
-    known = rows["effect"].notna()
+    has_effect = rows["effect"].notna()
     numbers = ["base", "value"]
     signs = {"up": rows["effect"] > 0, "down": rows["effect"] < 0}
-    grouped = rows.assign(**rows[numbers].where(known), **signs).groupby(by, sort=False)
+    grouped = rows.assign(**rows[numbers].where(has_effect), **signs).groupby(by, sort=False)
     table = grouped[[*numbers, "effect"]].mean()
     incomplete = rows[rows["why"] != ""].drop_duplicates([*by, "why"])
     why = incomplete.groupby(by, sort=False)["why"].agg("; ".join)
@@ -90,14 +90,14 @@ def _over_scenes(scenes: pd.DataFrame) -> pd.DataFrame:
     squares = scenes.assign(squares=freedom * scenes["spread"] ** 2, freedom=freedom)
     pooled = squares.groupby(_MEAN, sort=False)[["squares", "freedom"]].sum()
     means["scatter_replicates"] = np.sqrt(pooled["squares"] / pooled["freedom"])  # NaN for 0 / 0
-    only = scenes[scenes["effect"].notna()].drop_duplicates(_MEAN, keep=False).set_index(_MEAN)
+    single = scenes[scenes["effect"].notna()].drop_duplicates(_MEAN, keep=False).set_index(_MEAN)
     columns = ["spread", "n", "up", "down", "unit"]
-    means.loc[only.index, columns] = only[columns]
+    means.loc[single.index, columns] = single[columns]
     return means
 
 
 def _with_tests(means: pd.DataFrame, ratios: Collection[str]) -> pd.DataFrame:
-    """Return the means with changes, intervals and the p of their own tests."""
+    """Return the means with changes, intervals and the p of their tests, not yet corrected."""
     names = ("effect", "spread", "n", "up", "down")
     effect, spread, n, up, down = (means[name].to_numpy(np.float64) for name in names)
     half = half_width(spread, n)

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from xrgs.store.schema import Identity, Provenance, RecordedCell, Status, Summary
     from xrgs.store.store import Store
 
-#: What a sweep's record says of each cell.
+#: The columns of a sweep's record, which has a row for each planned cell.
 RECORD_KEYS = [
     "scene",
     "condition",
@@ -46,17 +46,17 @@ RECORD_KEYS = [
     "baseline_id",
     "error",
 ]
-#: The columns that name a cell in the tables of what cells did.
+#: The columns that name a cell in tables of training and curves.
 CELL_KEYS = ["cell_id", "scene", "label", "condition", "variant_seed", "seed"]
 #: Scores of views that a cell may have.
 _SCORES = (*VIEW_METRICS, *sorted(ON_REQUEST))
 #: Columns of `quality.csv`: steps done, time and alpha evaluations so far, Gaussians, mean scores.
 CURVE_COLUMNS = ["step", "seconds", "evaluations", "gaussians", *VIEW_METRICS]
-#: Columns of a history that describe the logged step alone, not the training up to it.
+#: Columns of a history that describe only the logged step; the others count from the first step.
 _SINGLE_STEP_COLUMNS = frozenset({"step", "loss", "gaussians"})
 
-#: Reasons of cells that are not done and did not fail, by the state of their folder. They do not
-#: say how far a cell is: the report would be another one a second later.
+#: State of a cell's folder -> the reason in tables, for cells that are not done and did not fail.
+#: How far a cell is would change the report every second, so it is left out.
 _PENDING = {
     "absent": "not trained yet",
     "planned": "not trained yet",
@@ -71,54 +71,53 @@ class ReportError(XrgsError):
 
 @dataclass(frozen=True)
 class DoneCell:
-    """What the files of a cell that is done say."""
+    """The content of a done cell's files."""
 
     status: Status
     identity: Identity
     summary: Summary
     provenance: Provenance
     config: Conf | None
-    """None where another version of xrgs has written it."""
+    """None if this version of xrgs can't read it."""
     scores: list[tuple[str, dict[str, float]]]
     """The name and the scores of each view."""
     totals: dict[str, float]
-    """The counts of its history over the whole training, and means of what components logged."""
+    """The counts of its history at the end of training, and means of components' logged values."""
     curve: list[dict[str, float]]
-    """A row of `CURVE_COLUMNS` for each evaluation during training, and a last one of the trained
-    cell, which is the only row where the cell was not evaluated during training."""
+    """A row of `CURVE_COLUMNS` for each evaluation during training (none without
+    `train.evaluate_every`), and a last row for the trained cell."""
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """One sweep as the store holds it: its cells, their scores, and what they were made with."""
+    """A sweep, or several that are joined, as the store holds them: cells, scores, provenance."""
 
     commands: Mapping[str, tuple[str, ...]]
-    """The arguments of `xrgs-sweep` by the sweep's id; several where sweeps are joined."""
+    """The id of each sweep -> the arguments of `xrgs-sweep`."""
     cells: pd.DataFrame
     """One row for each entry of the record, with these columns:
 
     - `RECORD_KEYS`, `state` and `reason`;
     - `protocol` and `<score>_code`: digests of the code that has rendered and scored the views;
-    - `stale`: names of the scores that the installed code would compute otherwise, or that are
-      missing;
-    - `validation`: `train.validation`, 0 where scores are of test views;
-    - `steps`, `long_side` and `factor` of the config;
-    - `machine`: what times depend on beside the program, empty where that is unknown;
+    - `stale`: names of the scores that are missing, or that other code than the installed computed;
+    - `validation`: `train.validation`; 0 if test views are scored;
+    - `steps`, `long_side` (px) and `factor` of the config;
+    - `machine`: processor, threads and the like, on which times depend; empty if unknown;
     - each metric by its name."""
     views: pd.DataFrame
     """One row for each cell and scored view: `cell_id`, `view` and the scores."""
     done: dict[str, DoneCell]
     """The files of the cells that are done, by the cell's id."""
     renders: dict[str, Path] = field(default_factory=dict)
-    """Folders of renders that another program made, by the ids of their rows, which are no cells
-    of the store (`xrgs.report.external`)."""
+    """Folders of another program's renders, by the `cell_id` of their rows in `cells`. The store
+    has no such cells (`xrgs.report.external`)."""
     variants: dict[str, SfmReport] = field(default_factory=dict)
-    """How the variants of the cells that are done were made, by the variant's id
+    """The SfM reports of the done cells' variants, by the variant's id
     (`xrgs.report.photographs`)."""
 
     @property
     def id(self) -> str:
-        """The id of the sweep; of several that are joined, all ids with a plus between them."""
+        """The id of the sweep, or the ids of all joined sweeps, with `+` between them."""
         return "+".join(self.commands)
 
     @property
@@ -134,11 +133,11 @@ class Sweep:
 def read_cells(
     store: Store, commands: Mapping[str, tuple[str, ...]], rows: Sequence[RecordedCell]
 ) -> Sweep:
-    """Read every cell that rows of records name.
+    """Read every cell of the rows of sweeps' records.
 
     Args:
         store: The store that has the cells.
-        commands: The arguments of `xrgs-sweep` by the ids of the sweeps that the rows are from.
+        commands: The id of each sweep -> the arguments of `xrgs-sweep`.
         rows: The rows.
 
     Raises:
@@ -148,12 +147,12 @@ def read_cells(
     done: dict[str, DoneCell] = {}
     columns: dict[str, dict[str, Any]] = {}
     for cell_id in progress(ids, "reading cells", "cell"):
-        found = _read_cell(store.cell(cell_id))
-        if isinstance(found, DoneCell):
-            done[cell_id] = found
-            columns[cell_id] = _done_columns(cell_id, found)
+        cell = _read_cell(store.cell(cell_id))
+        if isinstance(cell, DoneCell):
+            done[cell_id] = cell
+            columns[cell_id] = _done_columns(cell_id, cell)
         else:
-            columns[cell_id] = {"state": found.name, "reason": found.reason}
+            columns[cell_id] = {"state": cell.name, "reason": cell.reason}
     _check_identity("+".join(commands), rows, done)
     views = _views(done)
     return Sweep(
@@ -162,7 +161,7 @@ def read_cells(
 
 
 def _read_cell(cell: CellFolder) -> DoneCell | CellState:
-    """Read a cell; return the state of one that is not done, or has files that can't be read."""
+    """Read a cell, or return its state if it is not done or its files can't be read."""
     state = cell.state()
     if state.name == "done":
         try:
@@ -171,7 +170,7 @@ def _read_cell(cell: CellFolder) -> DoneCell | CellState:
             state = CellState.of_error(error)
     if state.name in _PENDING:
         return CellState("pending", _PENDING[state.name])
-    # Without the store's path: the report is the same wherever the store is.
+    # The report must not depend on where the store is.
     reason = state.reason.replace(f"{cell.path}/", "")
     return CellState(state.name, reason or state.name)
 
@@ -197,7 +196,7 @@ def _read_done(cell: CellFolder) -> DoneCell:
 
 
 def number_columns(file: Path) -> dict[str, list[float]]:
-    """Return the columns of a table of numbers, without the column `view`, which is text.
+    """Read a table of numbers by columns, without the column `view`, which is text.
 
     Raises:
         StoreError: The file is missing or damaged, or a value is not a number.
@@ -211,29 +210,29 @@ def number_columns(file: Path) -> dict[str, list[float]]:
 
 
 def _totals(history: Mapping[str, list[float]]) -> dict[str, float]:
-    """Return what training did: the counts of a history, and means of what components logged."""
+    """Return `DoneCell.totals`."""
     totals = {}
     for name, column in history.items():
         if not column or name in _SINGLE_STEP_COLUMNS:
             continue
         if is_component_log(name):
-            known = [value for value in column if not math.isnan(value)]
-            if known:
-                totals[name] = fmean(known)
+            values = [value for value in column if not math.isnan(value)]
+            if values:
+                totals[name] = fmean(values)
         else:
             totals[name] = column[-1]  # counts start at the first step
     return totals
 
 
 def is_component_log(column: str) -> bool:
-    """Return whether a component logged a column: its name is before a dot."""
+    """Return whether a component logged a column, which is then named `<component>.<value>`."""
     return "." in column
 
 
 def _curve(
     file: Path, summary: Summary, views: list[tuple[str, dict[str, float]]]
 ) -> list[dict[str, float]]:
-    """Return the quality of a cell during training, and at its end; NaN where a score is missing.
+    """Return `DoneCell.curve`; a missing score is NaN.
 
     Raises:
         StoreError: The file is damaged, or lacks a column.
@@ -253,17 +252,17 @@ def _curve(
     if missing := [name for name in CURVE_COLUMNS[:4] if name not in columns]:
         raise StoreError(f"damaged: {file}: there is no column {', '.join(missing)}")
     count = len(columns["step"])
-    unknown = [math.nan] * count
+    absent = [math.nan] * count
     return [
-        {name: columns.get(name, unknown)[at] for name in CURVE_COLUMNS} for at in range(count)
+        {name: columns.get(name, absent)[at] for name in CURVE_COLUMNS} for at in range(count)
     ] + [last]
 
 
 def _done_columns(cell_id: str, cell: DoneCell) -> dict[str, Any]:
-    """Return the columns of `Sweep.cells` for a cell that is done, but for its scores."""
+    """Return the columns of `Sweep.cells` for a done cell, without its scores."""
     figures = msgspec.structs.asdict(cell.summary)
     train, scored_by = cell.identity.train, without_refactorings(cell.status.scored_by)
-    size = cell.config.variant if cell.config else None
+    variant = cell.config.variant if cell.config else None
     return {
         **{metric.name: figures[metric.name] for metric in METRICS if metric.name in figures},
         **{f"{name}_code": scored_by.get(name, "") for name in _SCORES},
@@ -273,24 +272,24 @@ def _done_columns(cell_id: str, cell: DoneCell) -> dict[str, Any]:
         "stale": " ".join(stale_scores(scored_by)),
         "validation": train.get("validation", 0.0),
         "steps": cell.summary.steps,
-        "long_side": size.long_side if size else None,
-        "factor": size.factor if size else None,
+        "long_side": variant.long_side if variant else None,
+        "factor": variant.factor if variant else None,
         "machine": _machine(cell_id, cell.provenance),
     }
 
 
 def _machine(cell_id: str, made: Provenance) -> str:
-    """Return the machine that a cell's times depend on.
+    """Return the name of the machine that trained a cell.
 
-    Where several machines have trained the cell in turn, its id makes the name unique: no other
-    cell's times can be compared.
+    If several machines trained it in turn, the name has the cell's id: its times can't be compared
+    with those of any other cell.
     """
     turns = made.machines_in_turn
     return for_line(f"cell {cell_id} in turn: {turns}" if turns else machine(made), _MAX_MACHINE)
 
 
 def _views(done: Mapping[str, DoneCell]) -> pd.DataFrame:
-    """Return the scores as a table, with a column for each score, whether a cell has it or not."""
+    """Return `Sweep.views`; it has a column even for scores that no cell has."""
     rows = [
         {"cell_id": cell_id, "view": view} | scores
         for cell_id, cell in done.items()
@@ -321,7 +320,7 @@ def _cells(
 
 
 def _without_cell(row: RecordedCell) -> dict[str, str]:
-    """Return state and reason of a row that has no cell: it can't be trained, or not yet."""
+    """Return state and reason of a row without a cell id."""
     if row.error:
         return {"state": row.state or "failed", "reason": row.error}
     return {"state": "pending", "reason": "not trained yet: it waits for another cell's count"}
@@ -330,25 +329,25 @@ def _without_cell(row: RecordedCell) -> dict[str, str]:
 def _check_identity(
     sweep_id: str, rows: Iterable[RecordedCell], done: Mapping[str, DoneCell]
 ) -> None:
-    """Refuse a record that contradicts a cell: it would pair cells that do not belong together."""
+    """Refuse a record whose variant or seed is not the cell's: it would pair the wrong cells."""
     for row in rows:
         cell = done.get(row.cell_id or "")
         if cell is None:
             continue
         identity = cell.identity
-        for key, said, true in (
+        for key, recorded, actual in (
             ("variant_id", row.variant_id, identity.variant),
             ("seed", row.seed, identity.seed),
         ):
-            if said != true:
+            if recorded != actual:
                 raise ReportError(
-                    f"sweeps/{sweep_id}.json says {key} {said} of cell {row.cell_id}, "
-                    f"its identity.json says {true}"
+                    f"sweeps/{sweep_id}.json says {key} {recorded} of cell {row.cell_id}, "
+                    f"its identity.json says {actual}"
                 )
 
 
 def _provenance_entries(provenance: Provenance) -> Iterable[tuple[str, str]]:
-    """Yield the entries of a cell's provenance, but for the time at which it started."""
+    """Yield the entries of a cell's provenance, without the time of its start."""
     for key, value in msgspec.structs.asdict(provenance).items():
         if isinstance(value, dict):
             yield from ((f"{key}.{name}", str(inner)) for name, inner in value.items())

@@ -9,8 +9,8 @@ log(value / base), whose means and intervals become percent at the end: 100 (exp
 scene's change is the mean over its replicates, and the sweep's change is the mean over scenes, in
 which each scene counts once.
 
-Times are compared where both cells were trained on the same machine, with as many threads, and no
-other machine continued either. A score is compared where the same code has computed both values.
+Times are compared if both cells were trained on the same machine and number of threads from start
+to end. A score is compared if the same code has computed both values.
 
 The 95 % interval is Student's t around the mean. With several scenes it is over the scenes' means:
 it says how far the mean would move with other scenes like these, and includes the noise between
@@ -23,11 +23,11 @@ the t-tests of the outcomes are corrected together, over all ablations of a cond
 corrected apart from scores: nearly every ablation changes an amount, and such tests would make room
 for false discoveries among the scores.
 
-A condition may have `all_hr`, which trains on the originals of the degraded photographs. A pair
-then closes a share of the gap, 100 (value - base) / (all_hr - base), of the three cells of one
-scene and replicate: 0 is the base, 100 is what no method can know. The shares are averaged in the
-same way. A share needs all_hr to be better than the base, and is of scores of views alone: a gap in
-seconds or Gaussians would mean nothing.
+A condition may have `all_hr`, which trains on the originals of the degraded photographs. Then a
+pair closes a share of the gap, in percent: 100 (value - base) / (all_hr - base), from the three
+cells of one scene and replicate. 0 is the base, and 100 is the quality with all information. The
+shares are averaged in the same way. They exist only for scores of views, since a gap in seconds or
+Gaussians means nothing, and only if all_hr is better than the base.
 """
 
 from __future__ import annotations
@@ -66,13 +66,13 @@ if TYPE_CHECKING:
 _GROUP = ["label", "condition"]
 #: The units of the metrics that depend on the machine.
 _TIMES = frozenset({"s", "ms"})
-#: What a cell and the one that it is compared with have in common.
+#: The columns in which a cell and its base must agree.
 _PAIR = ["scene", "condition", "variant_seed", "seed"]
 
 
 @dataclass(frozen=True)
 class Design:
-    """What a comparison tests, and how small a change does not matter: named before the data."""
+    """The outcomes and margins of a comparison, which a study names before it has the data."""
 
     outcomes: tuple[str, ...] = (
         *("psnr", "psnr_pooled", "psnr_worst", "lpips"),
@@ -80,14 +80,14 @@ class Design:
     )
     """Names of the metrics that have a verdict, in the order of the tables."""
     headline: tuple[str, ...] = ()
-    """Labels whose tests are corrected by Holm: what a study claims of each of them."""
+    """Labels about which a study makes its claims: their tests are corrected by Holm."""
     margin_psnr: float = 0.2
     """The largest change of PSNR that counts as none, dB; our choice."""
     margin_lpips: float = 5.0
     """The largest change of LPIPS that counts as none, %; our choice."""
 
     def margin(self, metric: Metric) -> float:
-        """Return the margin of a metric, in the scale of its effect; 0 where it has none."""
+        """Return the margin of a metric in the unit of its effect; 0 if it has none."""
         if metric.unit == "dB":
             return self.margin_psnr
         is_lpips = metric.name in {"lpips", "lpips_vgg"}
@@ -95,14 +95,14 @@ class Design:
 
 
 def scored_by(metric: Metric) -> str:
-    """Return the score of views that a metric is, or follows from; empty for an amount."""
+    """Return the name of the score from which a metric is computed; empty for an amount."""
     if metric.score is None:
         return "psnr" if metric.unit == "dB" else ""
     return metric.name
 
 
 def is_ratio(metric: Metric) -> bool:
-    """Return whether a metric is compared by ratio, and shown in percent; else it is in dB."""
+    """Return whether changes of a metric are ratios, shown in percent; else differences in dB."""
     return metric.unit != "dB"
 
 
@@ -117,21 +117,20 @@ class Comparison:
     scenes: tuple[str, ...]
     """Names of the scenes, sorted."""
     groups: tuple[tuple[str, str], ...]
-    """(label, condition) of each label but the base, in the sweep's order."""
+    """(label, condition) of all labels except the base, in the sweep's order."""
     cells: pd.DataFrame
-    """`Sweep.cells` with `base_id`, the cell that each is compared with, and `elsewhere`, why their
-    times can't be compared: another machine has trained that cell, as far as is known, or this one
-    with another number of threads; empty where they can. The reason of an ablation without a
-    finished base says so."""
+    """`Sweep.cells` with two more columns: `base_id`, the cell that each is compared with, and
+    `elsewhere`, the reason if their times can't be compared (another machine or number of threads),
+    else empty. The `reason` of an ablation without a finished base says so."""
     pairs: pd.DataFrame
     """One row for each metric of each ablation's cell: `base`, `value`, `effect` (their difference
-    in dB, or the log of their ratio) and `why` there is no effect."""
+    in dB, or the logarithm of their ratio) and `why`, the reason if there is no effect."""
     per_scene: pd.DataFrame
     """Means over replicates, indexed by label, condition, scene, metric; its columns are described
     in `xrgs.report.averages.averaged`."""
     means: pd.DataFrame
-    """Means over scenes, indexed by label, condition, metric. Of an `outcome` there are `q`
-    (Benjamini and Hochberg), `holm` for headline labels, and `p_equivalent` of the TOST."""
+    """Means over scenes, indexed by label, condition, metric. An `outcome` also has corrected
+    tests: `q` (Benjamini and Hochberg), `holm` for headline labels, `p_equivalent` (TOST)."""
     gaps_per_scene: pd.DataFrame
     """As `per_scene`, with the share of the gap to all_hr (%) as the `change`: a row for each score
     and ablation in the conditions that have all_hr."""
@@ -197,30 +196,30 @@ def compare(
 
 
 def _check_design(design: Design, metrics: Sequence[Metric], cells: pd.DataFrame) -> None:
-    """Raise ReportError for an outcome that is no metric, and a headline that is no label."""
-    for key, kind, wanted, known in (
+    """Refuse an outcome that is no metric, and a headline that is no label."""
+    for key, kind, wanted, choices in (
         ("outcomes", "metric", design.outcomes, [metric.name for metric in metrics]),
         ("headline", "label", design.headline, list(dict.fromkeys(cells["label"]))),
     ):
-        if unknown := [name for name in wanted if name not in known]:
-            names = ", ".join(known)
+        if unknown := [name for name in wanted if name not in choices]:
+            names = ", ".join(choices)
             raise ReportError(f"{key}={unknown[0]}: there is no such {kind}; choose from: {names}")
 
 
 def _tested(means: pd.DataFrame, metrics: Sequence[Metric], design: Design) -> pd.DataFrame:
     """Return the means with the corrected tests of the outcomes, see `Comparison.means`."""
     by_name = {metric.name: metric for metric in metrics}
-    of = [by_name[name] for name in means.index.get_level_values("metric")]
-    outcome = np.array([metric.name in design.outcomes for metric in of], dtype=bool)
+    rows = [by_name[name] for name in means.index.get_level_values("metric")]
+    outcome = np.array([metric.name in design.outcomes for metric in rows], dtype=bool)
     headline = means.index.get_level_values("label").isin(design.headline)
-    amount = np.array([not scored_by(metric) for metric in of], dtype=bool)
+    amount = np.array([not scored_by(metric) for metric in rows], dtype=bool)
     families = [means.index.get_level_values("condition"), amount]
-    margin = np.array([design.margin(metric) for metric in of], dtype=np.float64)
+    margin = np.array([design.margin(metric) for metric in rows], dtype=np.float64)
     effect, spread, n = (means[name].to_numpy(np.float64) for name in ("effect", "spread", "n"))
 
     def corrected(chosen: NDArray[np.bool_], correct: Callable[[Floats], Floats]) -> pd.Series:
         p = means["p"].where(chosen)
-        return p.groupby(families).transform(lambda of: correct(of.to_numpy(np.float64)))
+        return p.groupby(families).transform(lambda group: correct(group.to_numpy(np.float64)))
 
     return means.assign(
         outcome=outcome,
@@ -231,10 +230,10 @@ def _tested(means: pd.DataFrame, metrics: Sequence[Metric], design: Design) -> p
 
 
 def _with_base(cells: pd.DataFrame, against: str) -> pd.DataFrame:
-    """Return the cells with `base_id` and `elsewhere`, as `Comparison.cells` has them.
+    """Return the cells with `base_id` and `elsewhere`, see `Comparison.cells`.
 
-    A base is found by scene, condition and replicate. The record names the baseline, but for a
-    sweep without it (`baseline=false`), which may be joined with one that has it.
+    A base is found by scene, condition and replicate. The record names the baseline, unless the
+    sweep has none (`baseline=false`) and is joined with one that has it.
     """
     labels = list(dict.fromkeys(cells["label"]))
     if against not in {*labels, BASELINE}:
@@ -247,18 +246,18 @@ def _with_base(cells: pd.DataFrame, against: str) -> pd.DataFrame:
         base_id = cells["baseline_id"].where(cells["baseline_id"].notna(), base_id)
     base_id = base_id.where(cells["label"] != against, cells["cell_id"])
     machines = cells.drop_duplicates("cell_id").set_index("cell_id")["machine"]
-    machine, of_base = cells["machine"], base_id.map(machines).astype(object).fillna("")
-    pairs = zip(machine, of_base, strict=True)
+    machine, base_machine = cells["machine"], base_id.map(machines).astype(object).fillna("")
+    pairs = zip(machine, base_machine, strict=True)
     elsewhere = pd.Series([_elsewhere(*pair) for pair in pairs], cells.index, object)
     return cells.assign(base_id=base_id, elsewhere=elsewhere)
 
 
-def _elsewhere(machine: str, of_base: str) -> str:
-    """Say why times of two machines, as `provenance.machine` names them, can't be compared."""
-    if machine == of_base or not (machine and of_base):
+def _elsewhere(machine: str, base: str) -> str:
+    """Return why times of two machines (`provenance.machine`) can't be compared; else empty."""
+    if machine == base or not (machine and base):
         return ""
-    alike = without_threads(machine) == without_threads(of_base)
-    return OTHER_THREADS if alike else OTHER_MACHINE
+    same_machine = without_threads(machine) == without_threads(base)
+    return OTHER_THREADS if same_machine else OTHER_MACHINE
 
 
 def _check_comparable(cells: pd.DataFrame, against: str) -> None:
@@ -285,7 +284,7 @@ def _check_comparable(cells: pd.DataFrame, against: str) -> None:
 
 
 def _check_pairs(ablations: pd.DataFrame, matched: pd.DataFrame, keys: Sequence[str]) -> None:
-    """Refuse an ablation that differs in a key from its base, the row of `matched` beside it."""
+    """Refuse an ablation that differs in a key from its base, the same row of `matched`."""
     for key in keys:
         differs = ablations[key].to_numpy() != matched[key].to_numpy()
         if differs.any():
@@ -319,13 +318,13 @@ def _name(cell: pd.Series) -> str:
 
 
 def _bases(cells: pd.DataFrame, against: str) -> pd.DataFrame:
-    """Return the planned cells of the base, one row for each, indexed by its id."""
+    """Return the base's planned cells, one row each, indexed by the cell's id."""
     planned = cells[(cells["label"] == against) & cells["cell_id"].notna()]
     return planned.drop_duplicates("cell_id").set_index("cell_id")
 
 
 def _pairs(cells: pd.DataFrame, metrics: Sequence[Metric], against: str) -> pd.DataFrame:
-    """Return the pairs of finished cells; set in `cells` why an ablation is without one."""
+    """Return the pairs of finished cells; set `reason` in `cells` for ablations without a base."""
     bases = _bases(cells, against)
     ablations = cells[(cells["label"] != against) & (cells["state"] == "done")]
     usable = ablations["base_id"].isin(bases.index[bases["state"] == "done"])
@@ -352,7 +351,7 @@ def _pairs(cells: pd.DataFrame, metrics: Sequence[Metric], against: str) -> pd.D
 def _incomparable(
     metric: Metric, paired: pd.DataFrame, matched: pd.DataFrame
 ) -> tuple[NDArray[np.bool_], str | NDArray[np.str_]]:
-    """Return which pairs have values of a metric that can't be compared, and why."""
+    """Return for which pairs a metric can't be compared, and the reason."""
     if score := scored_by(metric):
         code = f"{score}_code"
         return paired[code].to_numpy(str) != matched[code].to_numpy(str), OTHER_CODE
@@ -363,7 +362,7 @@ def _incomparable(
 def _gaps(
     pairs: pd.DataFrame, cells: pd.DataFrame, metrics: Sequence[Metric], against: str
 ) -> pd.DataFrame:
-    """Return the pairs of scores in conditions with all_hr; the effect is the share of the gap."""
+    """Return the pairs of scores in conditions with all_hr; `effect` is the share of the gap, %."""
     scores = {m.name: m.higher_is_better for m in metrics if m.score is not None}
     conditions = cells.loc[cells["label"].isin({ALL_HR} - {against}), "condition"].unique()
     rows = pairs[pairs["metric"].isin(scores) & pairs["condition"].isin(conditions)]
@@ -373,10 +372,10 @@ def _gaps(
     best = best[[*replicate, "value"]].rename(columns={"value": ALL_HR})
     rows = rows[rows["label"] != ALL_HR].merge(best, on=replicate, how="left")
     for name, higher_is_better in scores.items():
-        of = rows["metric"] == name
-        values = (rows.loc[of, key].to_numpy(np.float64) for key in ("base", "value", ALL_HR))
+        mask = rows["metric"] == name
+        values = (rows.loc[mask, key].to_numpy(np.float64) for key in ("base", "value", ALL_HR))
         share, why = share_of_gap(*values, higher_is_better=higher_is_better)
-        scored_otherwise = rows.loc[of, "why"] == OTHER_CODE
-        rows.loc[of, "effect"] = np.where(scored_otherwise, np.nan, share)
-        rows.loc[of, "why"] = np.where(scored_otherwise, OTHER_CODE, why)
+        scored_otherwise = rows.loc[mask, "why"] == OTHER_CODE
+        rows.loc[mask, "effect"] = np.where(scored_otherwise, np.nan, share)
+        rows.loc[mask, "why"] = np.where(scored_otherwise, OTHER_CODE, why)
     return rows

@@ -1,6 +1,6 @@
-"""What a table has to be read with: how its cells were trained and scored, and cautions.
+"""The context of a table: how its cells were trained and scored, and cautions.
 
-Text, Markdown, LaTeX and the page all show it.
+Tables show it in all formats: text, Markdown, LaTeX and HTML.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from xrgs.report.compare import Comparison
     from xrgs.store.schema import Provenance
 
-#: Scores of fewer views than these say little: one more view may turn their order.
+#: Scores of fewer views than this say little: one more view may reverse their order.
 _ENOUGH_VIEWS = 3
-#: The longest value of a config, processor's name and sentence that is shown, in characters.
+#: The longest shown value (of a config, or a processor's name) and sentence, in characters.
 _MAX_SHOWN = 120
 _MAX_SENTENCE = 240
 _ALL_HR = "all views HR"
@@ -40,18 +40,18 @@ class Context:
     training: tuple[str, ...] = ()
     """Steps, size, factor, test views and the rule against large Gaussians, as phrases."""
     machine: tuple[str, ...] = ()
-    """Processor, threads and backend, as phrases: what times depend on."""
+    """Processor, threads and backend, on which times depend, as phrases."""
     cautions: tuple[str, ...] = ()
-    """Sentences on scores that say less than they seem to."""
+    """Sentences on scores that are easily misread."""
 
     @property
     def of_scores(self) -> str:
-        """The context of a table without times; empty where nothing is known."""
+        """The context of a table without times; empty if nothing is known."""
         return "; ".join(self.training)
 
     @property
     def of_times(self) -> str:
-        """What times depend on beside the training; empty where nothing is known."""
+        """Processor, threads and backend, for a table of times; empty if nothing is known."""
         return "; ".join(self.machine)
 
     @property
@@ -61,43 +61,43 @@ class Context:
 
 
 def context_of(contexts: Mapping[str, Context], condition: str) -> Context:
-    """Return the context of a condition; an empty one where none is known."""
+    """Return the context of a condition; an empty one if none is known."""
     return contexts.get(condition, Context())
 
 
 def contexts(sweep: Sweep) -> dict[str, Context]:
     """Return the context of each condition; an empty one without finished cells."""
     cells = sweep.cells
-    own = cells[cells["cell_id"].isin(sweep.done)]
+    done = cells[cells["cell_id"].isin(sweep.done)]
     counts = sweep.views.groupby("cell_id")["view"].nunique()
-    found = {}
-    for condition, rows in own.groupby("condition", sort=False):
+    by_condition = {}
+    for condition, rows in done.groupby("condition", sort=False):
         tests = {
             str(scene): int(counts.reindex(ids).fillna(0).min())
             for scene, ids in rows.groupby("scene")["cell_id"]
         }
-        made = [sweep.done[cell_id] for cell_id in rows["cell_id"]]
-        configs = [cell.config for cell in made]
+        trained = [sweep.done[cell_id] for cell_id in rows["cell_id"]]
+        configs = [cell.config for cell in trained]
         reports = [sweep.variants.get(name) for name in rows["variant_id"]]
         tagged = not all(report and report.alike for report in reports)
         held_out = bool((rows["validation"] > 0).any())
-        found[str(condition)] = Context(
+        by_condition[str(condition)] = Context(
             (
                 *_sizes([config for config in configs if config], tagged=tagged),
                 _scored_views(tests, held_out=held_out),
                 *_prune_rule(zip(rows["label"], configs, strict=True)),
             ),
-            _machine([cell.provenance for cell in made]),
+            _machine([cell.provenance for cell in trained]),
             (
                 *_cautions(zip(rows["scene"], configs, strict=True), tests),
                 *_cautions_of_photographs(rows, sweep),
             ),
         )
-    return {name: found.get(name, Context()) for name in cells["condition"].unique()}
+    return {name: by_condition.get(name, Context()) for name in cells["condition"].unique()}
 
 
 def _distinct(values: Iterable[float | str | None]) -> str:
-    """Return the distinct values that are known as a text, in their order: `3,000 or 500`."""
+    """Join the distinct values in their order, without None: `3,000 or 500`."""
     return " or ".join(dict.fromkeys(_shown(value) for value in values if value is not None))
 
 
@@ -106,7 +106,7 @@ def _shown(value: float | str) -> str:
 
 
 def _sizes(configs: Sequence[Conf], *, tagged: bool) -> list[str]:
-    """Return phrases on steps and size and, where HR and LR tell something, on the mixture."""
+    """Return phrases on steps and size and, if views are `tagged` HR and LR, on the mixture."""
     if not configs:
         return []
     sizes = _distinct(config.variant.long_side for config in configs)
@@ -132,7 +132,7 @@ def _scored_views(tests: Mapping[str, int], *, held_out: bool) -> str:
 
 def _mixture(variant: VariantConf) -> str:
     """Return a phrase on how the LR views of a cell were made."""
-    chosen = variant.tags == "flag"  # and not by what the photographs are
+    chosen = variant.tags == "flag"  # by `hr_fraction`, not by the photographs' sampling rates
     if chosen and variant.hr_fraction == 1:
         return _ALL_HR
     degradation = resolve_degradation(variant)
@@ -146,7 +146,7 @@ def _mixture(variant: VariantConf) -> str:
 
 
 def _prune_rule(configs: Iterable[tuple[str, Conf | None]]) -> list[str]:
-    """Return a phrase on the rule against large Gaussians, with the labels where they differ."""
+    """Return a phrase on the pruning of large Gaussians; it names labels if they differ."""
     by_value: dict[str, dict[str, None]] = {}  # with the labels in order
     without_rule: dict[str, None] = {}
     for label, config in configs:
@@ -158,21 +158,21 @@ def _prune_rule(configs: Iterable[tuple[str, Conf | None]]) -> list[str]:
     if not by_value:
         return []
     several = len(by_value) > 1
-    each = (f"{v} ({', '.join(found)})" if several else v for v, found in by_value.items())
+    each = (f"{v} ({', '.join(labels)})" if several else v for v, labels in by_value.items())
     phrase = f"Gaussians above {', '.join(each)} times the scene's scale are pruned"
     if without_rule:
         phrase += f", and none for their size in {', '.join(without_rule)}"
     return [for_line(phrase, _MAX_SENTENCE)]
 
 
-def _machine(made: Sequence[Provenance]) -> tuple[str, ...]:
-    """Return phrases on what times depend on."""
-    threads = _distinct(one.threads for one in made)
+def _machine(trained: Sequence[Provenance]) -> tuple[str, ...]:
+    """Return `Context.machine` of trainings."""
+    threads = _distinct(one.threads for one in trained)
     phrases = (
-        _distinct(one.cpu for one in made),
-        _distinct(one.gpu for one in made),
+        _distinct(one.cpu for one in trained),
+        _distinct(one.gpu for one in trained),
         f"{threads} thread{'s' * (threads != '1')}",
-        _distinct(f"{one.backend} backend" for one in made),
+        _distinct(f"{one.backend} backend" for one in trained),
     )
     return tuple(filter(None, phrases))
 
@@ -204,11 +204,11 @@ def _cautions_of_photographs(rows: pd.DataFrame, sweep: Sweep) -> list[str]:
         rows: The rows of finished cells in `Sweep.cells`.
         sweep: The sweep.
     """
-    found = []
-    for scene, of in rows.groupby("scene", sort=False):
+    texts = []
+    for scene, scene_rows in rows.groupby("scene", sort=False):
         unscored: dict[str, None] = {}
         unmixed = False
-        for row in of.to_dict("records"):
+        for row in scene_rows.to_dict("records"):
             if (report := sweep.variants.get(row["variant_id"])) is None:
                 continue
             config = sweep.done[row["cell_id"]].config
@@ -218,10 +218,10 @@ def _cautions_of_photographs(rows: pd.DataFrame, sweep: Sweep) -> list[str]:
                 unscored |= dict.fromkeys(report.not_scored)
         if unscored:
             names = listed([*unscored])
-            found.append(f"{scene} is scored without test views that are not placed: {names}")
+            texts.append(f"{scene} is scored without test views that are not placed: {names}")
         if unmixed:
-            found.append(f"{scene} has no LR view: nothing is mixed")
-    return [for_line(f"Caution: {text}", _MAX_SENTENCE) for text in found]
+            texts.append(f"{scene} has no LR view: nothing is mixed")
+    return [for_line(f"Caution: {text}", _MAX_SENTENCE) for text in texts]
 
 
 def _holds_out(config: Conf) -> bool:
@@ -231,9 +231,9 @@ def _holds_out(config: Conf) -> bool:
 
 
 _PAIR = ["label", "condition", "scene", "variant_seed", "seed"]
-#: A view decides where the mean change without it differs by more than this share of the mean and
-#: by more than these dB, and where the view is this many times as far from the median of the other
-#: views as the farthest of them. Our choice.
+#: A view decides a mean change of PSNR if all three hold: without it the mean differs by more than
+#: _MIN_SHARE of the mean, and by more than _MIN_DB; and its distance from the median of the other
+#: views is more than _MIN_DISTANCE times that of the farthest other view. Our choice.
 _MIN_SHARE = 0.5
 _MIN_DB = 0.3
 _MIN_DISTANCE = 3.0
@@ -244,16 +244,16 @@ def decided_by_one_view(
 ) -> dict[tuple[str, str], list[str]]:
     """Warn of pairs where one view decides the change in PSNR.
 
-    A scene has few test views, and PSNR has no bound: a floater before one test camera can take 10
-    dB from its view, and so take more from the mean than all other views gain.
+    A scene has few test views, and PSNR has no bound: a floater in front of one test camera can
+    cost its view 10 dB, which is more than all other views gain together.
 
     Args:
         comparison: The pairs of cells.
         views: `Sweep.views`.
 
     Returns:
-        By label and condition a sentence for each such pair, which names the view and has the
-        change with it and without it.
+        (label, condition) -> a sentence for each such pair: the view, and the change with and
+        without it.
     """
     changes = _changes_of_views(comparison, views)
     pairs = _with_and_without(changes)
@@ -264,25 +264,25 @@ def decided_by_one_view(
         & (difference > _MIN_DB)
         & (pairs["distance"] > _MIN_DISTANCE * pairs["spread"])
     ]
-    found: dict[tuple[str, str], list[str]] = {}
+    notes: dict[tuple[str, str], list[str]] = {}
     for row in decided.to_dict("records"):
         text = (
             f"Caution: one view decides: on {row['scene']} (replicate"
             f" {row['variant_seed']}/{row['seed']}) PSNR changes by {signed(row['with_all'])} dB,"
             f" and without {row['view']} by {signed(row['without'])} dB"
         )
-        found.setdefault((row["label"], row["condition"]), []).append(for_line(text, _MAX_SENTENCE))
-    return found
+        notes.setdefault((row["label"], row["condition"]), []).append(for_line(text, _MAX_SENTENCE))
+    return notes
 
 
 def _changes_of_views(comparison: Comparison, views: pd.DataFrame) -> pd.DataFrame:
-    """Return the change in PSNR of each view of each pair, dB, where it is finite."""
+    """Return the finite changes in PSNR of each view of each pair, dB."""
     pairs = comparison.pairs[comparison.pairs["metric"] == "psnr"]
     # A record may have a row twice.
     pairs = pairs.loc[pairs["why"] != OTHER_CODE, [*_PAIR, "cell_id", "base_id"]].drop_duplicates()
     scores = views[["cell_id", "view", "psnr"]]
-    of_base = scores.rename(columns={"cell_id": "base_id", "psnr": "base_psnr"})
-    rows = pairs.merge(scores, on="cell_id").merge(of_base, on=["base_id", "view"])
+    base_scores = scores.rename(columns={"cell_id": "base_id", "psnr": "base_psnr"})
+    rows = pairs.merge(scores, on="cell_id").merge(base_scores, on=["base_id", "view"])
     with np.errstate(invalid="ignore"):  # inf - inf gives NaN, as it should
         rows["change"] = rows["psnr"] - rows["base_psnr"]
     finite: pd.DataFrame = rows[np.isfinite(rows["change"])].reset_index(drop=True)
@@ -292,17 +292,17 @@ def _changes_of_views(comparison: Comparison, views: pd.DataFrame) -> pd.DataFra
 def _with_and_without(changes: pd.DataFrame) -> pd.DataFrame:
     """Return the mean change of each pair with and without its most distant view.
 
-    One row a pair: `view`, the one farthest from the median of all; `n_views`; `with_all`, the mean
-    over all; `without`, the mean over the others; `spread`, how far the farthest of the others is
-    from their median; `distance`, how far the view is from that median.
+    One row for each pair: `view`, the one farthest from the median of all; `n_views`; `with_all`,
+    the mean over all; `without`, the mean over the others; `distance`, from the view to the median
+    of the others; `spread`, the largest distance of the others from their median. All in dB.
     """
     groups = changes.groupby(_PAIR, sort=False)["change"]
     far = (changes["change"] - groups.transform("median")).abs()
-    alone = far.groupby([changes[key] for key in _PAIR], sort=False).idxmax()
-    others = changes.drop(index=list(alone))
+    farthest = far.groupby([changes[key] for key in _PAIR], sort=False).idxmax()
+    others = changes.drop(index=list(farthest))
     rest = others.groupby(_PAIR, sort=False)["change"]
     spread = (others["change"] - rest.transform("median")).abs()
-    pairs = changes.loc[alone].set_index(_PAIR)
+    pairs = changes.loc[farthest].set_index(_PAIR)
     pairs = pairs.assign(
         n_views=groups.size(),
         with_all=groups.mean(),

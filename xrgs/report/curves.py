@@ -1,7 +1,6 @@
-"""Quality during training, and the time to the final quality of the base of the comparison.
+"""Quality during training, and the time until a cell reaches the final quality of its base.
 
-A cell that was trained with `train.evaluate_every` has the mean scores of its test views after
-every so many steps.
+A cell trained with `train.evaluate_every=N` has the mean scores of its test views every N steps.
 """
 
 from __future__ import annotations
@@ -31,8 +30,7 @@ def joined(cells: pd.DataFrame, done: Mapping[str, DoneCell]) -> pd.DataFrame:
         done: The cells that are done, by their ids.
 
     Returns:
-        One row for each evaluation: `CELL_KEYS` and `CURVE_COLUMNS`, in the order of the cells and
-        of the steps.
+        One row for each evaluation, with `CELL_KEYS` and `CURVE_COLUMNS`, by cell and step.
     """
     rows = [
         {"cell_id": cell_id, **row}
@@ -48,8 +46,8 @@ def means_over_runs(curves: pd.DataFrame, condition: str) -> pd.DataFrame:
     """Average the curves of one condition, as `joined` returns them, over runs.
 
     Returns:
-        `label`, `scene` and `CURVE_COLUMNS`: one row for each step after which all runs of a scene
-        and label were evaluated, in the order of the labels.
+        Columns `label`, `scene` and `CURVE_COLUMNS`; one row for each step at which all runs of a
+        scene and label were evaluated, in the order of the labels.
     """
     return _means(curves[curves["condition"] == condition], ["label", "scene"])
 
@@ -58,7 +56,7 @@ def means_over_scenes(scenes: pd.DataFrame) -> pd.DataFrame:
     """Average the curves of `means_over_runs` over the scenes that all labels have.
 
     Returns:
-        `label` and `CURVE_COLUMNS`; no row where no scene has all labels.
+        Columns `label` and `CURVE_COLUMNS`; no row if no scene has all labels.
     """
     labels = scenes.groupby("scene")["label"].nunique()
     common = labels.index[labels == scenes["label"].nunique()]
@@ -66,7 +64,7 @@ def means_over_scenes(scenes: pd.DataFrame) -> pd.DataFrame:
 
 
 def _means(rows: pd.DataFrame, by: list[str]) -> pd.DataFrame:
-    """Return the means of the rows that share the keys `by` and a step that all of them have."""
+    """Return the means over rows with the same keys `by`, at the steps that all their runs have."""
     grouped = rows.groupby([*by, "step"], sort=False)
     means, counts = grouped[CURVE_COLUMNS[1:]].mean(), grouped.size()
     means = means.mask(grouped[CURVE_COLUMNS[1:]].count().lt(counts, axis=0))
@@ -78,14 +76,13 @@ def first_reaches(quality: Sequence[float], amounts: Sequence[float], target: fl
     """Return the amount at which a curve first reaches a target.
 
     Args:
-        quality: Quality at each evaluation, NaN where it was not measured; higher is better.
+        quality: Quality at each evaluation, NaN if not measured; higher is better.
         amounts: Time or work so far at each evaluation.
         target: The quality to reach.
 
     Returns:
-        The amount, interpolated linearly between the first evaluation that has reached the target
-        and the one before it. Where the first evaluation has reached it, its amount; NaN where none
-        has.
+        The amount, interpolated linearly between the first evaluation that reaches the target and
+        the one before it. If the first evaluation reaches it, its amount; NaN if none does.
 
     Examples:
         >>> first_reaches([20.0, 22.0, 21.0], [10.0, 20.0, 30.0], 21.5)
@@ -104,20 +101,19 @@ def first_reaches(quality: Sequence[float], amounts: Sequence[float], target: fl
 
 
 def times(cells: pd.DataFrame, done: Mapping[str, DoneCell]) -> pd.DataFrame:
-    """Return when each cell first reaches the PSNR at which its base ends.
+    """Return the time and work in which each cell reaches the final PSNR of its base.
 
     Args:
         cells: The table `Comparison.cells`.
         done: The cells that are done, by their ids.
 
     Returns:
-        One row for each cell that was evaluated during training and has a base that is done:
+        One row for each cell that was evaluated during training and whose base is done:
         `CELL_KEYS`; `target`, the base's final PSNR of this scene and replicate, dB; `evaluations`
-        and `seconds` until the mean PSNR of the test views first reaches the target. Of both there
-        is the `_share` of the base's whole training, and the `_own_share` of what the base itself
-        takes until it first reaches its final PSNR: it may pass that PSNR early and fall again.
-        They are NaN where the target is not reached. A time of another machine than the base's has
-        no share.
+        and `seconds` until the mean PSNR of the test views first reaches the target, NaN if it
+        never does. Each of the two also has a ratio `_share`, to the base's whole training, and
+        `_own_share`, to what the base takes until it first reaches its own final PSNR (it may pass
+        that early and fall again). If the base ran on another machine, the ratios of time are NaN.
     """
     rows = []
     for _, cell in cells[cells["cell_id"].isin(done)].drop_duplicates(CELL_KEYS).iterrows():
@@ -127,23 +123,23 @@ def times(cells: pd.DataFrame, done: Mapping[str, DoneCell]) -> pd.DataFrame:
         end = base.curve[-1]
         row = dict(cell[CELL_KEYS]) | {"target": end["psnr"]}
         for name in ("evaluations", "seconds"):
-            row[name], own = (_first_passage(of, name, end["psnr"]) for of in (curve, base.curve))
+            row[name], own = (_first_passage(run, name, end["psnr"]) for run in (curve, base.curve))
             comparable = not cell["elsewhere"] or name != "seconds"
             for share, whole in (("share", end[name]), ("own_share", own)):
-                known = comparable and whole > 0
-                row[f"{name}_{share}"] = row[name] / whole if known else math.nan
+                has_share = comparable and whole > 0
+                row[f"{name}_{share}"] = row[name] / whole if has_share else math.nan
         rows.append(row)
     return pd.DataFrame(rows, columns=[*CELL_KEYS, "target", *_ROWS])
 
 
 def _first_passage(curve: Sequence[Mapping[str, float]], name: str, target: float) -> float:
-    """Return the time or work after which a curve first has a PSNR."""
+    """Return the time or work at which a curve first reaches a PSNR, dB."""
     quality, amounts = ([at[key] for at in curve] for key in ("psnr", name))
     return first_reaches(quality, amounts, target)
 
 
-#: The rows of a table for each column of `times`: name, where `{base}` stands for the label of the
-#: base, and factor and format of the number.
+#: Column of `times` -> the row of a table: its name (`{base}` is the base's label), the factor of
+#: its number, and the number's format.
 _ROWS = {
     "evaluations": ("Alpha evaluations, 10^9", 1e-9, ",.3g"),
     "evaluations_share": ("Evaluations, % of {base}'s whole training", 100.0, ".0f"),
@@ -154,19 +150,19 @@ _ROWS = {
 }
 
 
-def table(found: pd.DataFrame, labels: Sequence[str], condition: str, base: str) -> TextTable:
-    """Return the table of what `times` has found for one condition, as means over runs.
+def table(reached: pd.DataFrame, labels: Sequence[str], condition: str, base: str) -> TextTable:
+    """Return the table of `times` for one condition.
 
-    It has rows for each scene, and means of the shares over scenes where there are several.
+    It has rows for each scene, means over its runs, and with several scenes the mean shares.
     """
-    chosen = found[found["condition"] == condition]
+    chosen = reached[reached["condition"] == condition]
     rows = [
         row
         for scene in sorted(chosen["scene"].unique())
         for row in _rows_of(scene, chosen[chosen["scene"] == scene], labels, _ROWS, base)
     ]
     if len(set(chosen["scene"])) > 1:
-        # Each scene counts once; it is NaN, not reached, where one of its runs is.
+        # Each scene counts once; if one of its runs does not reach the target, it is NaN.
         scenes = chosen.groupby(["label", "scene"], sort=False)[[*_ROWS]].agg(_mean_of_all)
         shares = [name for name in _ROWS if name.endswith("_share")]
         rows += _rows_of("mean over scenes", scenes.reset_index(), labels, shares, base)
@@ -204,7 +200,7 @@ def _rows_of(
 
 
 def _text(rows: pd.DataFrame | None, name: str) -> str:
-    """Return a mean, or why there is none; empty where there is no row."""
+    """Return a mean as text, or why there is none; empty without rows."""
     if rows is None:
         return ""
     reached = int(rows[name.partition("_")[0]].notna().sum())

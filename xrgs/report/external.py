@@ -1,10 +1,10 @@
-"""Renders of the test views that another program made, as one more label of a sweep's report.
+"""Adds another program's renders of the test views to a sweep's report, as one more label.
 
 They are scored by the metrics of the frozen protocol against the photographs of the variant, and
-compared by the same statistics. They are 8-bit PNGs, and our own cells are scored as float32
-images: the rounding costs PSNR 0.005 dB at 30 dB and 0.05 dB at 40 dB, and SSIM 0.0004 on the
-embedded scene. Time, Gaussians and memory are known where a file beside the renders has them
-(`Figures`), else n/a.
+compared by the same statistics. They are 8-bit PNGs, while our own cells are scored as float32
+images: rounding to 8 bits costs 0.005 dB of PSNR at 30 dB and 0.05 dB at 40 dB, and 0.0004 of SSIM
+on the embedded scene. Time, Gaussians and memory come from `figures.json` beside the renders
+(`Figures`), else they are n/a.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ if TYPE_CHECKING:
     from xrgs.mixture.views import View
     from xrgs.report.joined import ReportStore
 
-#: Another program's renders become one row for each combination of these.
+#: Another program's renders become one row for each combination of these columns.
 _VARIANT = ["scene", "condition", "variant_seed"]
-#: What the row has in common with the cells that it is compared with.
+#: Columns that the row takes from the cells that it is compared with.
 _SHARED = [*("variant_id", "baseline_id", "seed"), "validation", "long_side", "factor"]
 
 FIGURES = "figures.json"
@@ -46,10 +46,10 @@ _Measured = Annotated[float, Meta(gt=0, le=1e30)] | None
 
 
 class Figures(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """`figures.json`, beside the renders of a scene: what the other program's training took."""
+    """`figures.json` beside the renders of a scene: time and size of that program's training."""
 
     training_time_s: _Measured = None
-    """Seconds of training, on the machine of the cells that it is compared with."""
+    """Seconds of training, on the machine that trained the sweep's cells."""
     gaussians: _Measured = None
     memory_bytes: _Measured = None
     peak_rss_bytes: _Measured = None
@@ -57,7 +57,7 @@ class Figures(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class External:
-    """Where another program's renders are, and what the tables call them."""
+    """Another program's renders: their label in the tables, and their folder."""
 
     label: str
     folder: Path
@@ -67,59 +67,59 @@ def parse(words: Sequence[str]) -> tuple[External, ...]:
     """Read the words of `xrgs-report --external LABEL:FOLDER LABEL:FOLDER`.
 
     Args:
-        words: Folders, each with a label before it or named by the folder's own name.
+        words: Folders, each as `LABEL:FOLDER`, or only `FOLDER`, whose name is then the label.
 
     Raises:
         ReportError: A label or a folder is empty, or two labels are the same.
     """
-    found = []
+    externals = []
     for part in words:
         label, colon, folder = part.partition(":")
         if not colon or "/" in label:  # a path may have a colon
             label, folder = "", part
         path = user_path(folder)
-        found.append(External(label or path.name, path))
-        if not folder or not found[-1].label:
+        externals.append(External(label or path.name, path))
+        if not folder or not externals[-1].label:
             raise ReportError(f"external={part}: must be FOLDER or LABEL:FOLDER")
-    labels = [one.label for one in found]
+    labels = [one.label for one in externals]
     if len(set(labels)) < len(labels):
         raise ReportError(
             f"external={' '.join(words)}: two folders have the same label; use LABEL:FOLDER"
         )
-    return tuple(found)
+    return tuple(externals)
 
 
 def with_external(sweep: Sweep, store: ReportStore, externals: Sequence[External]) -> Sweep:
-    """Return a sweep with a row for each variant that another program has rendered.
+    """Return a sweep with one more row for each variant that another program has rendered.
 
-    A program has one set of renders for a variant. They are paired with the cells of the lowest
-    seed, in each condition.
+    A program has one set of renders for a variant. In each condition, they are compared with the
+    cells of the lowest seed.
 
     Args:
         sweep: The sweep.
         store: The stores that have the sweep's variants.
         externals: The programs' renders: `<view>.png` for each scored view, in the folder
-            `<scene>/<variant.seed>/`. Where a scene has one draw of HR views, `<scene>/` will do;
-            where the sweep also has one scene, the folder itself. `figures.json` beside them may
+            `<scene>/<variant.seed>/`. If a scene has one draw of HR views, `<scene>/` will do, and
+            if the sweep also has only one scene, the folder itself. `figures.json` beside them may
             have numbers of the training.
 
     Returns:
         The sweep with these rows in `cells` and `views`, and their folders in `renders`.
 
     Raises:
-        ReportError: Cells have a label of the renders, a folder or a render is missing, or a render
-            is not an 8-bit RGB PNG of its view's size. The message names the file and the format.
-        StoreError: A `figures.json` has another key or a value that is no number above 0.
+        ReportError: Cells already have the label, a folder or a render is missing, or a render is
+            not an 8-bit RGB PNG of its view's size. The message names the file and the format.
+        StoreError: A `figures.json` has an unknown key, or a value that is no number above 0.
         CorruptVariant: A variant is damaged.
     """
-    for one in externals:
-        if one.label in set(sweep.cells["label"]):
-            raise ReportError(f"external={one.label}: cells of the sweep have that label")
-        sweep = _with_one(sweep, store, one)
+    for program in externals:
+        if program.label in set(sweep.cells["label"]):
+            raise ReportError(f"external={program.label}: cells of the sweep have that label")
+        sweep = _with_program(sweep, store, program)
     return sweep
 
 
-def _with_one(sweep: Sweep, store: ReportStore, one: External) -> Sweep:
+def _with_program(sweep: Sweep, store: ReportStore, program: External) -> Sweep:
     done = sweep.cells[sweep.cells["state"] == "done"].sort_values("seed", kind="stable")
     done = done[~done["cell_id"].isin(sweep.renders)]
     rows: list[dict[str, Any]] = []
@@ -128,18 +128,18 @@ def _with_one(sweep: Sweep, store: ReportStore, one: External) -> Sweep:
     groups = done.drop_duplicates(_VARIANT).to_dict("records")
     for number, cell in enumerate(groups):
         views = sweep.views.loc[sweep.views["cell_id"] == cell["cell_id"], "view"]
-        folder = _folder(one, cell, done)
-        cell_id = f"{for_file_name(one.label)}.{number}"  # no cell's id has a dot
+        folder = _folder(program, cell, done)
+        cell_id = f"{for_file_name(program.label)}.{number}"  # no cell's id has a dot
         split = "train" if cell["validation"] > 0 else "test"
         expected = _expected(store, str(cell["variant_id"]), split)
-        bar = progress(list(views), f"scoring {one.label}", "view")
+        bar = progress(list(views), f"scoring {program.label}", "view")
         masked = any(expected[name].mask for name in views)
         scores += [{"cell_id": cell_id} | _score(folder, expected[name], masked) for name in bar]
         renders[cell_id] = folder
         rows.append(
             {key: cell[key] for key in (*_VARIANT, *_SHARED, "protocol")}
             | {f"{name}_code": scoring_code()[name] for name in VIEW_METRICS}
-            | {"cell_id": cell_id, "label": one.label, "state": "done"}
+            | {"cell_id": cell_id, "label": program.label, "state": "done"}
             | _figures(folder)
             | dict.fromkeys(("reason", "stale", "machine"), "")
         )
@@ -153,39 +153,41 @@ def _with_one(sweep: Sweep, store: ReportStore, one: External) -> Sweep:
     return replace(sweep, cells=cells, views=both, renders=renders)
 
 
-def _folder(one: External, cell: Mapping[Hashable, Any], done: pd.DataFrame) -> Path:
-    """Return the folder with the renders of a cell's variant: the first of these that is there."""
+def _folder(program: External, cell: Mapping[Hashable, Any], done: pd.DataFrame) -> Path:
+    """Return the first existing folder for renders of a cell's variant, see `with_external`."""
     scene, draw = str(cell["scene"]), int(cell["variant_seed"])
     draws = done.loc[done["scene"] == scene, "variant_seed"].nunique()
-    root, inside = one.folder, []
+    root, candidates = program.folder, []
     if is_inside(scene):
-        inside = [root / scene / str(draw)] + [root / scene] * (draws == 1)
+        candidates = [root / scene / str(draw)] + [root / scene] * (draws == 1)
     if draws == 1 and set(done["scene"]) == {scene}:
-        inside.append(root)
+        candidates.append(root)
     try:
-        found = [folder for folder in inside if folder.is_dir()]
+        existing = [folder for folder in candidates if folder.is_dir()]
     except OSError as error:
-        raise ReportError(f"external={one.label}: {one.folder}: {error.strerror}") from error
-    if not found:
-        wanted = (
-            " or ".join(map(str, inside))
+        raise ReportError(
+            f"external={program.label}: {program.folder}: {error.strerror}"
+        ) from error
+    if not existing:
+        expected = (
+            " or ".join(map(str, candidates))
             or "a folder of the scene, though its name can't be a folder's name,"
         )
         raise ReportError(
-            f"external={one.label}: there are no renders of {scene} with variant.seed={draw}: "
-            f"{wanted} is expected, with <view>.png for each view that is scored"
+            f"external={program.label}: there are no renders of {scene} with variant.seed={draw}: "
+            f"{expected} is expected, with <view>.png for each view that is scored"
         )
-    return found[0]
+    return existing[0]
 
 
 def _figures(folder: Path) -> dict[str, float | None]:
-    """Return what is known of the training, by metric."""
+    """Read `figures.json`: metric -> its value, None if unknown."""
     file = folder / FIGURES
     return msgspec.structs.asdict(read_struct(file, Figures) if file.exists() else Figures())
 
 
 def _expected(store: ReportStore, variant_id: str, split: str) -> dict[str, View]:
-    """Return the views of a variant that cells are scored on, by name."""
+    """Return the views of a split of a variant, by name."""
     frozen = variant.load(store.variant(variant_id))
     return {view.name: view for view in frozen.views if view.split == split}
 

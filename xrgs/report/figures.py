@@ -1,8 +1,8 @@
-"""Draws a comparison: renders side by side, curves, number of Gaussians against quality.
+"""Draws the figures of a report: renders side by side, curves, number of Gaussians against quality.
 
-Each function returns the bytes of a PNG. The same inputs give the same bytes: matplotlib's own
-style is used whatever the user's is, and no date or version is written. pyplot is not used, since
-it keeps figures in memory.
+Each function returns the bytes of a PNG. The same inputs give the same bytes: matplotlib's default
+style replaces the user's, and no date or version is written. pyplot is not used, since it keeps
+figures in memory.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ if TYPE_CHECKING:
 
 #: Okabe and Ito's orange and blue, which colour-blind readers can distinguish, also in grey.
 _ABLATION, _BASELINE, _FRAME = "#D55E00", "#0072B2", "#FFD400"
-#: Colour and mark of the baseline, and of up to seven ablations: more of Okabe and Ito's colours.
-#: Their yellow is left out, since it is faint on white.
+#: Colour and mark of the baseline, then of up to seven ablations: Okabe and Ito's colours without
+#: yellow, which is faint on white.
 _ARMS = (
     (_BASELINE, "o"),
     (_ABLATION, "s"),
@@ -49,18 +49,18 @@ _ARMS = (
     ("#777777", "*"),
 )
 MAX_ARMS = len(_ARMS)
-"""The most labels that one figure of curves can tell apart."""
+"""The most labels in one figure of curves."""
 _DPI = 130
 _PANEL = 3.4  # inches
 _ZOOM = 5
-#: An axis is logarithmic where the largest value is this many times the smallest one.
+#: An axis is logarithmic if its largest value is at least this many times the smallest.
 _LOG_FROM = 4
-#: The longest name beside a figure's axes, in characters: a longer one would leave them no room.
+#: The longest name beside a figure's axes, in characters; longer ones leave the axes no room.
 _MAX_NAME = 40
 
 
 class Panel(NamedTuple):
-    """One image of a row, with its title and the line under it."""
+    """An image of a figure, with its title and the line under it."""
 
     image: Image  # [H, W, 3] 0..1
     title: str
@@ -69,10 +69,10 @@ class Panel(NamedTuple):
 
 @contextmanager
 def _default_style() -> Iterator[None]:
-    """Use matplotlib's own style, in which a name with dollar signs is not read as mathematics.
+    """Use matplotlib's default style, without mathematics between dollar signs.
 
-    Characters that its font lacks are drawn as boxes, and scripts that it can't shape letter by
-    letter, without a warning: the tables of the report have the name.
+    Warnings about characters that the font lacks or can't shape are hidden: the report's tables
+    have the names.
     """
     with style.context(["default", {"text.parse_math": False}]), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
@@ -86,10 +86,10 @@ def differing_crop(first: Image, second: Image, zoom: int = _ZOOM) -> tuple[slic
     Args:
         first: [H, W, 3] in 0..1.
         second: [H, W, 3] in 0..1.
-        zoom: The sides of the images over the sides of the window.
+        zoom: The ratio of the images' sides to the window's.
 
     Returns:
-        The window's rows and columns; of equal windows, the topmost and then the leftmost.
+        The window's rows and columns; of equally different windows, the topmost, then the leftmost.
     """
     difference = np.abs(first.astype(np.float64) - second).mean(axis=2)  # [H, W]
     height, width = (max(1, side // zoom) for side in difference.shape)
@@ -106,10 +106,13 @@ def differing_crop(first: Image, second: Image, zoom: int = _ZOOM) -> tuple[slic
 def side_by_side(
     title: str, panels: Sequence[Panel], crop: tuple[slice, slice], note: str
 ) -> bytes:
-    """Draw the panels in a row with `crop` framed, and each panel's crop enlarged below it.
+    """Draw panels in a row with a crop framed, and each panel's crop enlarged below it.
 
-    The panels are photograph, baseline and ablation, of one size. `crop` is as `differing_crop`
-    returns it, and `note` says how it was chosen, for example "where the two differ most".
+    Args:
+        title: The title of the figure.
+        panels: Photograph, baseline and ablation, of one size.
+        crop: Rows and columns, as `differing_crop` returns them.
+        note: How the crop was chosen, for example "where the two differ most".
     """
     rows, columns = crop
     height, width = panels[0].image.shape[:2]
@@ -140,8 +143,10 @@ def curves(
 ) -> bytes:
     """Draw training curves over steps: one panel for each column, one line for each run.
 
-    `runs` are label and history (with `step` and `columns`) of the baseline, then of the ablation.
-    `columns` has the title of the panel of each column.
+    Args:
+        title: The title of the figure.
+        runs: Label and history (with `step` and `columns`) of the baseline, then of the ablation.
+        columns: Column of the history -> title of its panel.
     """
     figure = _figure(_PANEL * 1.5 * len(columns), _PANEL)
     figure.suptitle(for_line(title, MAX_CELL), fontsize=11)
@@ -165,15 +170,17 @@ def curves(
 def quality_curves(
     title: str, scenes: pd.DataFrame, means: pd.DataFrame, axes: Sequence[Metric]
 ) -> bytes:
-    """Draw quality during training against time and against alpha evaluations.
+    """Draw quality during training against time and against alpha evaluations; better is up.
 
-    Better is up. Each label has a colour: a thick line with marks is its mean over scenes, thin
-    ones are its scenes. Horizontal lines are where the baseline ends. Each of `axes` is a score,
-    and has a row of panels.
+    Each label has a colour: a thick line with marks is its mean over scenes, thin lines are its
+    scenes. Horizontal lines are the baseline's final quality.
 
-    `scenes` has one row for each label, scene and evaluation: `label`, `scene`, `seconds`,
-    `evaluations` and the scores. There are at most `MAX_ARMS` labels, and the first is the
-    baseline. `means` are over scenes, with the same columns but `scene`.
+    Args:
+        title: The title of the figure.
+        scenes: One row for each label, scene and evaluation: `label`, `scene`, `seconds`,
+            `evaluations` and the scores. At most `MAX_ARMS` labels, the baseline first.
+        means: The means over scenes, with the same columns without `scene`.
+        axes: The scores; each has a row of panels.
     """
     figure = _figure(_PANEL * 3 + 2.2, _PANEL * len(axes) + 0.6)
     figure.suptitle(for_line(title, MAX_CELL), fontsize=11)
@@ -196,7 +203,7 @@ def quality_curves(
 def _quality_panel(
     axis: Axes, scenes: pd.DataFrame, means: pd.DataFrame, amount: str, quality: str
 ) -> dict[str, Line2D]:
-    """Draw one panel of curves; returns a line for each label."""
+    """Draw one panel of curves; return the mean line of each label."""
     labels = list(dict.fromkeys(scenes["label"]))
     for label, (color, _) in zip(labels, _ARMS, strict=False):
         for _, curve in scenes[scenes["label"] == label].groupby("scene"):
@@ -208,7 +215,7 @@ def _quality_panel(
     for label, (color, mark) in zip(labels, _ARMS, strict=False):
         curve = means[means["label"] == label]
         (lines[label],) = axis.plot(curve[amount], curve[quality], color=color, linewidth=1.8)
-        # A few marks, at other evaluations for each label.
+        # A few marks, at different evaluations for each label.
         every = max(1, len(curve) // 6)
         lines[label].set(marker=mark, markersize=5, markevery=(len(lines) % every, every))
         if label == labels[0] and len(curve):
@@ -218,7 +225,7 @@ def _quality_panel(
 
 
 def _leave_out_the_start(axis: Axes, scenes: pd.DataFrame, metric: Metric) -> None:
-    """Let better be up, and begin the axis at the worst value after a quarter of a curve."""
+    """Scale the quality axis to the last three quarters of the curves, with better up."""
     curves = scenes.groupby(["label", "scene"])[metric.name]
     later = scenes.loc[curves.cumcount() >= curves.transform("size") // 4, metric.name]
     worst, best = later[np.isfinite(later)].agg(["min", "max"])
@@ -233,14 +240,18 @@ def _leave_out_the_start(axis: Axes, scenes: pd.DataFrame, metric: Metric) -> No
 def trade_off(
     title: str, means: pd.DataFrame, scenes: pd.DataFrame, axes: Sequence[Metric]
 ) -> bytes:
-    """Draw each ablation by its number of Gaussians and its quality, one panel for each score.
+    """Draw quality against the number of Gaussians, a dot for each label; better is up and left.
 
-    Better is up and left. A numbered dot is a label's mean over scenes. Thin lines lead from the
-    baseline to the ablations in each scene, and blue ones cross at the baseline's mean.
+    A numbered dot is a label's mean over scenes. Thin lines lead from the baseline to the ablations
+    in each scene, and blue lines cross at the baseline's mean.
 
-    `means` has one row for each label, the baseline first: `gaussians`, `scenes` (how many the mean
-    is over), and a column for each of `axes`, the scores. `scenes` has one row for each label and
-    scene, indexed by the label: `scene`, `gaussians` and the scores.
+    Args:
+        title: The title of the figure.
+        means: One row for each label, the baseline first: `gaussians`, `scenes` (their number) and
+            a column for each score.
+        scenes: One row for each label and scene, indexed by the label: `scene`, `gaussians` and the
+            scores.
+        axes: The scores; each has a panel.
     """
     figure = _figure(_PANEL * 1.1 * len(axes) + 2, max(_PANEL, 0.2 * len(means)))
     figure.suptitle(for_line(title, MAX_CELL), fontsize=11)
@@ -253,8 +264,8 @@ def trade_off(
             panel.invert_yaxis()
     most = int(means["scenes"].max())
     names = "\n".join(
-        f"{at} {for_line(str(label), _MAX_NAME)}" + f" ({of} of {most} scenes)" * bool(of < most)
-        for at, (label, of) in enumerate(means["scenes"].items())
+        f"{at} {for_line(str(label), _MAX_NAME)}" + f" ({n} of {most} scenes)" * bool(n < most)
+        for at, (label, n) in enumerate(means["scenes"].items())
     )
     panels[-1].annotate(names, (1.04, 1), xycoords="axes fraction", va="top", fontsize=8)
     return _png(figure)
@@ -292,13 +303,17 @@ def _dots(axis: Axes, means: pd.DataFrame, scenes: pd.DataFrame, quality: str) -
 
 @_default_style()
 def dependence(title: str, key: str, changes: pd.DataFrame, axes: Sequence[Metric]) -> bytes:
-    """Draw how changes depend on a setting, one panel for each metric.
+    """Draw how changes depend on a setting; better is up, and the dashed line is the base.
 
-    Better is up, and the dashed line is the base. Each series has a colour: a thick line with marks
-    is its mean over scenes, thin ones are its scenes, and dots are its pairs.
+    Each series has a colour: a thick line with marks is its mean over scenes, thin lines are its
+    scenes, and dots are its pairs.
 
-    `changes` is what `xrgs.report.pictures.sensitivities` returns for the key of the setting, with
-    at most `MAX_ARMS - 1` series. Each of `axes` is a metric.
+    Args:
+        title: The title of the figure.
+        key: The key of the setting.
+        changes: The key's entry in `xrgs.report.pictures.sensitivities`, with at most
+            `MAX_ARMS - 1` series.
+        axes: The metrics; each has a panel.
     """
     figure = _figure(_PANEL * len(axes), _PANEL + 0.6)
     figure.suptitle(for_line(title, MAX_CELL), fontsize=11)
@@ -324,7 +339,7 @@ def dependence(title: str, key: str, changes: pd.DataFrame, axes: Sequence[Metri
 
 
 def _dependence_line(axis: Axes, rows: pd.DataFrame, look: tuple[str, str]) -> Line2D:
-    """Draw one series of a panel; returns the line of its mean."""
+    """Draw one series of a panel; return the line of its mean."""
     color, mark = look
     of = {level: rows[rows["level"] == level] for level in ("pair", "scene", "mean")}
     axis.plot(
@@ -337,7 +352,7 @@ def _dependence_line(axis: Axes, rows: pd.DataFrame, look: tuple[str, str]) -> L
 
 
 def _scaled(axis: Axes, values: Sequence[float]) -> None:
-    """Mark the values of a setting, on a logarithmic axis where they spread over a factor."""
+    """Mark the values of a setting on its axis, see `_LOG_FROM`."""
     if values[0] > 0 and values[-1] >= _LOG_FROM * values[0]:
         axis.set_xscale("log")
         axis.xaxis.set_minor_locator(NullLocator())
@@ -351,7 +366,7 @@ def _with_grid(axis: Axes) -> None:
 
 
 def _figure(width: float, height: float) -> Figure:
-    """Make an empty figure of this size in inches."""
+    """Make an empty figure; its size is in inches."""
     return Figure(figsize=(width, height), dpi=_DPI, layout="constrained")
 
 

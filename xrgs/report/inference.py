@@ -1,7 +1,7 @@
 """The statistics of a report: changes of pairs, intervals, tests, and corrections for many tests.
 
 All functions take and return float64 arrays [N], one element for each pair or mean. A number that
-can't be computed is NaN; of a change of a pair, a reason says why.
+can't be computed is NaN. Changes of pairs come with the reason why they can't be computed.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 CONFIDENCE = 0.95
-#: The fewest values behind a mean that a verdict or a test may rest on: our choice. Two values show
-#: too little of their scatter: Student's interval of them is 13 times as wide as they are apart.
+#: The fewest values behind a mean with a verdict or a test; our choice. Two values show too little
+#: of their scatter: Student's interval for them is 13 times as wide as their distance.
 MIN_VALUES = 3
-#: The corrected p up to which a change counts as shown, and the p of the test of equivalence.
+#: The largest (corrected) p at which a change, or an equivalence, counts as shown.
 LEVEL = 0.05
 NOT_MEASURED = "not measured"
 OTHER_MACHINE = "timed on another machine"
@@ -29,7 +29,7 @@ OTHER_CODE = "scored by other code"
 NOT_FINITE = "not finite"
 NOT_POSITIVE = "not above zero"
 
-#: Label of the cells that the share of the gap is measured by.
+#: Label of the cells at the upper end of the gap, see `share_of_gap`.
 ALL_HR = "all_hr"
 NO_ALL_HR = f"{ALL_HR} gave no number to compare"
 NO_GAP = f"{ALL_HR} has the same value"
@@ -44,7 +44,7 @@ def difference(base: Floats, value: Floats) -> tuple[Floats, NDArray[np.str_]]:
         value: [N] values of the ablation, in the same unit.
 
     Returns:
-        The differences [N], and why there is none [N], empty where there is one.
+        The differences [N], and the reasons [N] where there is none, else empty.
     """
     with np.errstate(all="ignore"):
         change = value - base
@@ -67,8 +67,8 @@ def log_ratio(base: Floats, value: Floats) -> tuple[Floats, NDArray[np.str_]]:
         value: [N] values of the ablation, in the same unit.
 
     Returns:
-        The logarithms [N], and why there is none [N], empty where there is one. Equal finite values
-        have 0, whatever their sign.
+        The logarithms [N], and the reasons [N] where there is none, else empty. Equal finite values
+        give 0, whatever their sign.
 
     Examples:
         >>> log_ratio(np.array([2.0, 2.0]), np.array([2.0, 0.0]))[0]
@@ -97,12 +97,12 @@ def share_of_gap(
     Args:
         base: [N] values of the base.
         value: [N] values of the ablation, in the same unit.
-        all_hr: [N] values of all_hr, in the same unit; NaN where it gave none.
+        all_hr: [N] values of all_hr, in the same unit; NaN if there is none.
         higher_is_better: The direction of the metric.
 
     Returns:
-        The shares [N], and why there is none [N], empty where there is one. A share is negative
-        where the ablation is worse than the base, and above 100 where it is better than all_hr.
+        The shares [N], %, and the reasons [N] where there is none, else empty. A share is negative
+        if the ablation is worse than the base, and above 100 if it is better than all_hr.
 
     Examples:
         >>> args = np.array([20.0]), np.array([23.0]), np.array([24.0])
@@ -156,9 +156,9 @@ def prediction_half_width(spread: Floats, n: Floats) -> Floats:
 
 
 def p_values(mean: Floats, spread: Floats, n: Floats) -> Floats:
-    """Return the p of Student's two-sided test, of each mean, that the true mean is 0.
+    """Return the p of Student's two-sided test of each mean; null hypothesis: the true mean is 0.
 
-    It is below 0.05 just where the 95 % interval does not hold 0.
+    It is below 0.05 if and only if the 95 % interval does not contain 0.
 
     Args:
         mean: [N] means.
@@ -166,7 +166,7 @@ def p_values(mean: Floats, spread: Floats, n: Floats) -> Floats:
         n: [N] number of values behind each mean.
 
     Returns:
-        [N]; NaN for fewer than `MIN_VALUES`, and where all values are 0: nothing has changed.
+        [N]; NaN for fewer than `MIN_VALUES`, or if all values are 0.
     """
     with np.errstate(all="ignore"):
         p = 2 * stdtr(n - 1, -np.abs(mean) / spread * np.sqrt(n))
@@ -174,32 +174,32 @@ def p_values(mean: Floats, spread: Floats, n: Floats) -> Floats:
 
 
 def sign_test(up: Floats, down: Floats) -> Floats:
-    """Return the p of the exact two-sided sign test, that both signs are equally likely.
+    """Return the p of the exact two-sided sign test; null hypothesis: the signs are equally likely.
 
     Args:
         up: [N] numbers of values above 0.
         down: [N] numbers of values below 0. Values of 0 are left out, as is usual.
 
     Returns:
-        [N]; 1 where there is no value.
+        [N]; 1 if there is no value.
     """
     n = (up + down).astype(np.int64)
     return np.asarray(np.minimum(1.0, 2 * bdtr(np.minimum(up, down), n, 0.5)))
 
 
 def equivalence(mean: Floats, spread: Floats, n: Floats, margin: Floats) -> Floats:
-    """Return the p of two one-sided t-tests (TOST), that the true mean is not within the margin.
+    """Return the p of two one-sided t-tests (TOST); null hypothesis: the mean is not in the margin.
 
-    At 0.05 it shows a mean within the margin just where the 90 % interval is within it.
+    It is at most 0.05 if and only if the 90 % interval of the mean is within the margin.
 
     Args:
         mean: [N] means.
         spread: [N] sample standard deviations, with n - 1 in the denominator, in the same unit.
         n: [N] number of values behind each mean.
-        margin: [N] in the same unit, at least 0: what is smaller does not matter.
+        margin: [N] the largest change that does not matter, in the same unit, at least 0.
 
     Returns:
-        [N], NaN for fewer than `MIN_VALUES`. Equal values are within the margin (0) or not (1).
+        [N], NaN for fewer than `MIN_VALUES`. If all values are equal, 0 within the margin, else 1.
 
     Source: [schuirmann1987].
     """
@@ -237,7 +237,7 @@ def holm(p: Floats) -> Floats:
 
 
 def false_discovery_rates(p: Floats) -> Floats:
-    """Return q of each test: the least rate of false discoveries at which it is one.
+    """Return q of each test: the least false discovery rate at which it counts as a discovery.
 
     Of the m tests sorted by p, q of the i-th is the minimum of p_j m / j over j >= i. It holds for
     tests that are independent or positively dependent.

@@ -1,4 +1,4 @@
-"""Joins the records of several sweeps of a store, and chooses rows of them, for one report.
+"""Joins the records of several sweeps of a store, and chooses the rows of a report.
 
 A study may be trained in parts, for example scene by scene. Its report needs the rows of all
 records. A store from another machine comes in through `xrgs-store import`.
@@ -24,18 +24,18 @@ if TYPE_CHECKING:
     from xrgs.store.schema import RecordedCell
     from xrgs.store.store import Store
 
-#: The most ids that the name of a report lists.
+#: The most ids in the name of a report's folder.
 _MAX_LISTED = 4
 
 
 @dataclass(frozen=True)
 class Choice:
-    """Which rows of a sweep a report has."""
+    """The scenes and ablations that a report shows."""
 
     scenes: tuple[str, ...] = ()
     """Names of scenes; empty for all."""
     ablations: tuple[str, ...] = ()
-    """Labels of ablations and controls, beside what they are compared with; empty for all."""
+    """Labels of ablations and controls, beside their base; empty for all."""
 
     def rows(self, rows: Sequence[RecordedCell], against: str) -> list[RecordedCell]:
         """Return the chosen rows of a record.
@@ -45,8 +45,7 @@ class Choice:
             against: The label that all others are compared with; its rows and the baseline's stay.
 
         Raises:
-            ReportError: No row has a scene or a label that is named; the message lists those that
-                there are.
+            ReportError: No row has a chosen scene or label; the message lists the existing ones.
         """
         _check_known("scenes", self.scenes, [row.scene for row in rows])
         _check_known("ablations", self.ablations, [row.label for row in rows])
@@ -60,30 +59,30 @@ class Choice:
 
     @property
     def suffix(self) -> str:
-        """What the name of the report's folder says of the choice; empty where it is everything."""
+        """The end of the report's folder name that tells the choice; empty if all is chosen."""
         parts = (("scenes", self.scenes), ("ablations", self.ablations))
         return "".join(f".{key}-{for_file_name(','.join(names))}" for key, names in parts if names)
 
 
-def _check_known(key: str, wanted: Iterable[str], known: Sequence[str]) -> None:
+def _check_known(key: str, wanted: Iterable[str], choices: Sequence[str]) -> None:
     for name in wanted:
-        if name not in known:
+        if name not in choices:
             raise ReportError(
                 f"{key}={name}: the sweep has none of that name; choose from:"
-                f" {', '.join(dict.fromkeys(known))}"
+                f" {', '.join(dict.fromkeys(choices))}"
             )
 
 
 @dataclass(frozen=True)
 class ReportStore:
-    """The store from which a report is made, with renders of other programs."""
+    """A store with the renders of other programs, from which a report is made."""
 
     store: Store
     external: Mapping[str, Path] = field(default_factory=dict)
-    """Folders of renders that another program made, `Sweep.renders`."""
+    """Folders of another program's renders, see `Sweep.renders`."""
 
     def cell(self, cell_id: str) -> CellFolder:
-        """Return the folder of a cell, which need not exist.
+        """Return the folder of a cell, whether or not it exists.
 
         Raises:
             StoreError: The id is not a valid name of a folder.
@@ -91,7 +90,7 @@ class ReportStore:
         return self.store.cell(cell_id)
 
     def variant(self, variant_id: str) -> Path:
-        """Return the folder of a variant, which need not exist.
+        """Return the folder of a variant, whether or not it exists.
 
         Raises:
             StoreError: The id is not a valid name of a folder.
@@ -99,7 +98,7 @@ class ReportStore:
         return self.store.variant(variant_id)
 
     def variant_report(self, variant_id: str) -> SfmReport:
-        """Read how a variant was made, also where its images were removed on purpose.
+        """Read the SfM report of a variant, even if its images were trimmed.
 
         Raises:
             StoreError: The store lacks the variant, or its report is damaged or can't be read now.
@@ -108,14 +107,14 @@ class ReportStore:
         return read_report(trimmed if trimmed.is_dir() else self.store.variant(variant_id))
 
     def render(self, cell_id: str, view: str) -> Path:
-        """Return the file of the render of a view, which need not exist.
+        """Return the file of the render of a view, whether or not it exists.
 
         Args:
             cell_id: The id of a cell, or of a row of another program's renders.
             view: The name of the view.
 
         Raises:
-            StoreError: The cell's renders were removed on purpose, or its id is not a valid name.
+            StoreError: The cell's renders were trimmed, or its id is not a valid name.
         """
         if cell_id in self.external:
             return self.external[cell_id] / f"{view}.png"
@@ -124,7 +123,7 @@ class ReportStore:
         return cell.path / name
 
     def without_paths(self, text: str) -> str:
-        """Return a text without the path of the store: a report is the same wherever it is."""
+        """Remove the store's path from a text, so that reports don't depend on it."""
         return text.replace(f"{self.store.path}/", "")
 
     def sweep_records(
@@ -133,11 +132,11 @@ class ReportStore:
         """Join the records of sweeps.
 
         Args:
-            sweep_ids: Their ids.
+            sweep_ids: The ids of the sweeps.
 
         Returns:
-            The arguments of `xrgs-sweep` of each record, by the sweep's id, and the rows of all,
-            one for each scene, condition, label and replicate.
+            The id of each sweep -> the arguments of `xrgs-sweep`; and the rows of all records, one
+            for each scene, condition, label and replicate.
 
         Raises:
             StoreError: There is no such sweep, or its record is damaged.
@@ -151,15 +150,15 @@ class ReportStore:
             commands[sweep_id] = record.command
             for row in record.cells:
                 key = (row.scene, row.condition, row.label, row.variant_seed, row.seed)
-                rows[key] = sweep_id, _same(rows.get(key), sweep_id, row)
+                rows[key] = sweep_id, _fuller(rows.get(key), sweep_id, row)
         return commands, [row for _, row in rows.values()]
 
 
-def _same(known: tuple[str, RecordedCell] | None, sweep_id: str, row: RecordedCell) -> RecordedCell:
-    """Return the row that says more of two for the same cell; refuse two different cells."""
-    if known is None or known[1].cell_id is None:
+def _fuller(old: tuple[str, RecordedCell] | None, sweep_id: str, row: RecordedCell) -> RecordedCell:
+    """Return, of two rows for one run, the one with a cell id; refuse two different cells."""
+    if old is None or old[1].cell_id is None:
         return row
-    before, first = known
+    before, first = old
     if row.cell_id in {None, first.cell_id}:
         return first
     name = " / ".join(filter(None, (row.scene, row.label, row.condition)))
@@ -173,7 +172,7 @@ def _same(known: tuple[str, RecordedCell] | None, sweep_id: str, row: RecordedCe
 
 
 def report_name(sweep_ids: Sequence[str]) -> str:
-    """Return the name of the folder for the report of sweeps: their ids, joined by `+`."""
+    """Return the name of a report's folder: the ids of its sweeps, joined by `+`."""
     more = len(sweep_ids) - _MAX_LISTED
     listed = "+".join(sweep_ids[:_MAX_LISTED])
     return f"{listed}+{for_file_name(' '.join(sweep_ids[_MAX_LISTED:]))}" if more > 0 else listed

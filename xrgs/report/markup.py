@@ -1,4 +1,4 @@
-"""Writes tables as Markdown and LaTeX, whatever characters they hold."""
+"""Writes tables as Markdown and LaTeX; any character of their texts is escaped."""
 
 from __future__ import annotations
 
@@ -15,26 +15,27 @@ if TYPE_CHECKING:
 
 #: Shrinks a table that is wider than the text.
 _LATEX_FITTED = r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%"
-#: What a document needs for the tables of `to_latex`.
+#: Packages that a document needs for the tables of `to_latex`.
 _LATEX_PREAMBLE = "% The document needs \\usepackage{booktabs} and \\usepackage{graphicx}.\n"
-#: LaTeX takes 50 tables with no text between them ("100 consecutive dead cycles" at more).
+#: Tables between two page breaks: LaTeX fails at more than 50 without text between them ("100
+#: consecutive dead cycles").
 _MOST_FLOATS = 25
 
 
 def titled(text: str, condition: str) -> str:
-    """Return a heading that names the condition, where there is one."""
+    """Return a heading with its condition in brackets, if there is one."""
     return f"{text} ({condition})" if condition else text
 
 
 def filled_places(rows: Sequence[tuple[str, ...]]) -> list[int]:
-    """Return the places of the columns that have a text in any row."""
+    """Return the indices of the columns that have a text in any row."""
     return [place for place, texts in enumerate(zip(*rows, strict=True)) if any(texts)]
 
 
 def filled(table: TextTable) -> TextTable:
-    """Return a table without the columns that are empty in every row; as it is without rows.
+    """Remove the columns that are empty in every row; a table without rows stays as it is.
 
-    The table must have no `spans` and `best`, which name columns by their place.
+    The table must have no `spans` and `best`, which name columns by their index.
     """
     if not table.rows:
         return table
@@ -48,7 +49,7 @@ def filled(table: TextTable) -> TextTable:
 
 
 def to_markdown(table: TextTable) -> str:
-    """Write a table as GitHub-flavoured Markdown under a heading, aligned in the source as well."""
+    """Write a table as GitHub-flavoured Markdown with a heading; the source is aligned, too."""
     head, *body = (tuple(map(for_markdown, one_line(row))) for row in (table.heads, *table.rows))
     lines, sizes = padded([head, *_marked(body, table.best, "**{}**")], table.align)
     rule = [
@@ -66,7 +67,7 @@ def to_markdown(table: TextTable) -> str:
 def _marked(
     rows: list[tuple[str, ...]], best: frozenset[tuple[int, int]], form: str
 ) -> list[tuple[str, ...]]:
-    """Return the rows with `form` around the cells that are best."""
+    """Put the best cells, (row, column), into `form`, such as `**{}**`."""
     return [
         tuple(form.format(text) if (i, j) in best else text for j, text in enumerate(row))
         for i, row in enumerate(rows)
@@ -74,7 +75,7 @@ def _marked(
 
 
 def to_latex(table: TextTable) -> str:
-    """Write a table as LaTeX of the packages `booktabs` and `graphicx`, with caption and label."""
+    """Write a table as LaTeX with caption and label; it needs `booktabs` and `graphicx`."""
     head, *body = (tuple(map(for_latex, one_line(row))) for row in (table.columns, *table.rows))
     lines = [" & ".join(row) + r" \\" for row in _marked(body, table.best, r"\textbf{{{}}}")]
     notes = [rf"\par\footnotesize {for_latex(note)}" for note in table.notes]
@@ -102,7 +103,7 @@ def to_latex(table: TextTable) -> str:
 
 
 def latex_file(tables: Sequence[TextTable]) -> str:
-    r"""Write tables as a file that a document of LaTeX includes by `\input`."""
+    r"""Write tables as a file for `\input` in a LaTeX document."""
     texts = [to_latex(table) for table in tables]
     for last in range(_MOST_FLOATS - 1, len(texts) - 1, _MOST_FLOATS):
         texts[last] += "\\clearpage\n"
@@ -110,7 +111,7 @@ def latex_file(tables: Sequence[TextTable]) -> str:
 
 
 def _latex_spans(table: TextTable) -> list[str]:
-    """Return the row of headings over the columns, and the rules below them; nothing for none."""
+    """Return the row of headings over several columns and the rules below it; [] for none."""
     if not table.spans:
         return []
     cells, rules, column = [], [], 1

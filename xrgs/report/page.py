@@ -1,4 +1,4 @@
-"""Writes the report of a sweep from its store alone: the same store gives the same bytes."""
+"""Writes the report of a sweep, which depends only on the store: the same store, the same bytes."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from xrgs.report.external import External
     from xrgs.store.schema import RecordedCell
 
-#: The most ablations that are printed with tables of their own; overview and files have all.
+#: Up to this many ablations are printed with tables of their own; the files have all.
 _MAX_PRINTED_ABLATIONS = 6
 _MAX_PRINTED_MISSING = 20
 _PROVENANCE_KEYS = (
@@ -54,7 +54,7 @@ _PROVENANCE_KEYS = (
 )
 
 
-#: The choice of every scene and ablation.
+#: All scenes and ablations.
 _EVERYTHING = Choice()
 
 
@@ -63,35 +63,35 @@ class Report:
     """A report that `build` has written."""
 
     text: str
-    """The tables for a terminal, with the path of the page at the end."""
+    """The tables for a terminal, then the path of report.html."""
     folder: Path
-    """The folder that it was written to."""
+    """The folder with the files."""
     files: tuple[Path, ...]
     """Every file that was written, sorted."""
 
 
 @dataclass(frozen=True)
 class Runs:
-    """Tables of what the trainings of a sweep did."""
+    """Data on the trainings of a sweep: curves, counts, times and skipped work."""
 
     labels: dict[str, list[str]]
     """The labels of each condition's cells, in the sweep's order."""
     training: pd.DataFrame
-    """What training did in each cell: `xrgs.report.work.totals`."""
+    """Counts of each training: `xrgs.report.work.totals`."""
     curves: pd.DataFrame
     """Quality during training: `xrgs.report.curves.joined`."""
     times: pd.DataFrame
     """Time and work to the base's final PSNR: `xrgs.report.curves.times`."""
     skipped: pd.DataFrame
-    """What each cell left out: `xrgs.report.work.skipped`."""
+    """Work that each cell skipped: `xrgs.report.work.skipped`."""
 
     @classmethod
-    def of(cls, sweep: Sweep, cells: pd.DataFrame) -> Runs:
+    def gather(cls, sweep: Sweep, cells: pd.DataFrame) -> Runs:
         """Gather the tables of a sweep's compared cells."""
         cells = cells[~cells["cell_id"].isin(sweep.renders)]  # nothing is known of other programs
         labels = cells.groupby("condition", sort=False)["label"].unique()
         return cls(
-            {str(name): list(of) for name, of in labels.items()},
+            {str(name): list(group) for name, group in labels.items()},
             work.totals(cells, sweep.done),
             curves.joined(cells, sweep.done),
             curves.times(cells, sweep.done),
@@ -105,7 +105,7 @@ class Runs:
             (partial(work.skipped_table, base=base), self.skipped),
             (work.totals_table, self.training),
         )
-        return [make(found, of, name) for make, found in kinds for name, of in self.labels.items()]
+        return [make(frame, of, name) for make, frame in kinds for name, of in self.labels.items()]
 
 
 def build(
@@ -123,25 +123,24 @@ def build(
     Args:
         store_path: The store's folder.
         sweep_ids: The id of the sweep, or the ids of those to join; None takes the latest one.
-        out: The folder to write to; None takes `reports/<sweep ids>` in the store. To its name
-            `.scenes-<names>` and `.ablations-<names>` are added for a choice, and
-            `.against-<label>` for another base than the baseline.
+        out: The folder to write to; None takes `reports/<sweep ids>` in the store, with
+            `.scenes-<names>` and `.ablations-<names>` added for a choice, and `.against-<label>`
+            for another base than the baseline.
         pictures: Names of the pictures to draw, see `xrgs.report.pictures.draw`; None draws all.
-        against: The label that all others are compared with. Where no cell is a baseline
-            (`baseline=false`), the first label stands in for it.
-        choice: Which scenes and ablations of the sweeps the report has.
+        against: The label that all others are compared with. If no cell is a baseline
+            (`baseline=false`), the first label replaces the baseline.
+        choice: The scenes and ablations of the report.
         externals: Renders of other programs; each becomes one more label. The default folder's name
             then ends with `.with-<label>` for each.
-        design: What the tables test; None takes the defaults.
+        design: Outcomes, headline labels and margins of the tests; None takes the defaults.
 
     Returns:
         The report: its text and its files.
 
     Raises:
         StoreError: The store has no such sweep.
-        ReportError: The sweeps contradict each other, have nothing that is chosen, have cells that
-            can't be compared, or have no such label; there is no picture of such a name; or `out`
-            can't be written.
+        ReportError: The sweeps contradict each other, lack a chosen scene or label, or have cells
+            that can't be compared; there is no picture of such a name; or `out` can't be written.
     """
     store = ReportStore(Store(store_path))
     named = (sweep_ids,) if isinstance(sweep_ids, str) else sweep_ids
@@ -170,7 +169,7 @@ def build(
 
 
 def _base(rows: Sequence[RecordedCell], against: str) -> str:
-    """Return `against`, or the first label for the baseline of a sweep that has none."""
+    """Return `against`; for the baseline of sweeps without it, their first label."""
     labels = [row.label for row in rows]
     return labels[0] if against == BASELINE and BASELINE not in labels else against
 
@@ -184,7 +183,7 @@ def _tables(sweep: Sweep, against: str, design: Design | None) -> Tables:
 def _folder_name(
     ids: Sequence[str], choice: Choice, against: str, externals: Sequence[External]
 ) -> str:
-    """Return the default name of a report's folder: the sweeps, and what was chosen of them."""
+    """Return the default name of a report's folder, see `build`."""
     base = "" if against == BASELINE else f".against-{for_file_name(against)}"
     others = "".join(f".with-{for_file_name(one.label)}" for one in externals)
     return f"{report_name(ids)}{choice.suffix}{base}{others}"
@@ -197,10 +196,10 @@ def _write(
     tables: Tables,
     pictures: Sequence[str] | None,
 ) -> list[Picture]:
-    """Draw the pictures, and write them with all other files; return the pictures."""
+    """Write all files of a report; return its pictures."""
     (folder / "figures").mkdir(exist_ok=True)
     comparison = tables.comparison
-    runs = Runs.of(sweep, comparison.cells)
+    runs = Runs.gather(sweep, comparison.cells)
     drawn = draw(store, comparison, sweep.views, runs.curves, folder / "figures", pictures)
     _write_data(folder, sweep, comparison, runs)
     changes = _change_tables(tables)
@@ -242,7 +241,7 @@ _FILES = (
 
 
 def _write_data(folder: Path, sweep: Sweep, comparison: Comparison, runs: Runs) -> None:
-    """Write the tables and the provenance that other programs read."""
+    """Write the CSV tables and the provenance, for other programs."""
     cells = comparison.cells
     names = cells.drop_duplicates("cell_id")[CELL_KEYS]
     views = names.merge(sweep.views, on="cell_id")
@@ -266,10 +265,10 @@ def _csv(table: pd.DataFrame) -> str:
 
 
 def _change_tables(tables: Tables) -> list[TextTable]:
-    """Return every table of changes and values: first what is missing, then overviews."""
+    """Return all tables of changes and values: missing cells first, then overviews."""
     comparison = tables.comparison
-    overviews, own = _overviews(tables), _ablation_tables(tables)
-    result = [*overviews, legend(comparison, [*overviews, *own]), *own]
+    overviews, ablations = _overviews(tables), _ablation_tables(tables)
+    result = [*overviews, legend(comparison, [*overviews, *ablations]), *ablations]
     conditions = dict.fromkeys(comparison.cells["condition"])
     result += [tables.scores(name) for name in conditions]
     result += [tables.values(name) for name in conditions]
@@ -318,9 +317,9 @@ def _command_line(sweep_id: str, command: Sequence[str]) -> str:
 
 
 def _photographs(sweep: Sweep) -> list[str]:
-    """Return a list of Markdown of what became of the photographs of each scene."""
-    found = photographs(sweep)
-    lines = [f"- {for_markdown(f'{scene}: {note}')}\n" for scene, notes in found for note in notes]
+    """Return a Markdown section with the notes on each scene's photographs."""
+    pairs = [(scene, note) for scene, notes in photographs(sweep) for note in notes]
+    lines = [f"- {for_markdown(f'{scene}: {note}')}\n" for scene, note in pairs]
     return ["## Photographs\n", *lines] if lines else []
 
 
@@ -332,8 +331,8 @@ def _picture_link(picture: Picture, folder: Path) -> str:
 
 
 def _provenance_table(sweep: Sweep) -> TextTable:
-    made = sweep.provenance
-    rows = tuple((key, "; ".join(made.get(key, ["n/a"]))) for key in _PROVENANCE_KEYS)
+    provenance = sweep.provenance
+    rows = tuple((key, "; ".join(provenance.get(key, ["n/a"]))) for key in _PROVENANCE_KEYS)
     return TextTable("Made with", ("", "values"), rows, "ll")
 
 
@@ -365,23 +364,23 @@ def _warnings(sweep: Sweep) -> list[str]:
         )
     machines = sorted(set(sweep.cells["machine"]) - {""})
     if len(machines) > 1:
-        alike = len({*map(without_threads, machines)}) == 1
-        how = "with different numbers of threads" if alike else "on different machines"
+        same = len({*map(without_threads, machines)}) == 1
+        how = "with different numbers of threads" if same else "on different machines"
         warnings.append(
             f"The cells were trained {how} ({'; '.join(machines)}): times are compared only between"
-            f" cells of {'one number of threads' if alike else 'one machine'}."
+            f" cells of {'one number of threads' if same else 'one machine'}."
         )
     arithmetics = sweep.provenance.get("arithmetic", ())
     if len(arithmetics) > 1:
         warnings.append(
             f"The cells were trained with different arithmetic ({', '.join(arithmetics)}): that"
-            " alone makes cells differ as much as another seed does."
+            " makes cells differ as much as another seed does."
         )
     return warnings
 
 
 def _stale_warning(sweep: Sweep) -> list[str]:
-    """Warn of scores that the installed code would compute otherwise, or that are missing."""
+    """Warn of scores that are missing, or that other code than the installed computed."""
     stale = sweep.cells.loc[sweep.cells["stale"] != "", ["cell_id", "stale"]].drop_duplicates()
     if stale.empty:
         return []
@@ -389,20 +388,20 @@ def _stale_warning(sweep: Sweep) -> list[str]:
     always = [m for m in METRICS if m.score and not m.optional]
     scores = [m.label for m in always if names & {m.name, PROTOCOL}]
     return [
-        f"The scores of {counted(len(stale), 'cell')} are missing or of other code than is"
-        f" installed ({', '.join(scores)}): xrgs-store rescore computes them. A score is compared"
-        " between cells that the same code has scored."
+        f"Scores of {counted(len(stale), 'cell')} are missing, or other code than the installed has"
+        f" computed them ({', '.join(scores)}): xrgs-store rescore computes them. A score is"
+        " compared between cells that the same code has scored."
     ]
 
 
 def _other_programs(sweep: Sweep) -> list[str]:
-    """Return the labels of renders that another program made."""
+    """Return the labels of other programs' renders."""
     rows = sweep.cells[sweep.cells["cell_id"].isin(sweep.renders)]
     return list(dict.fromkeys(rows["label"]))
 
 
 def _text(tables: Tables, warnings: list[str]) -> str:
-    """Return the text that a command prints: no more tables than a terminal can show."""
+    """Return the text for a terminal, which has only some of the tables."""
     comparison = tables.comparison
     printed = _overviews(tables)
     if len(comparison.groups) <= _MAX_PRINTED_ABLATIONS:

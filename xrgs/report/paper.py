@@ -48,9 +48,9 @@ if TYPE_CHECKING:
     from xrgs.report.joined import ReportStore
     from xrgs.report.writing import Change
 
-#: Labels of the full XR-GS, with one reading of section 5.4 each.
+#: Labels of the full XR-GS; each reads section 5.4 of the paper in another way.
 _READINGS = ("xrgs", "xrgs_per_class", "xrgs_own_threshold")
-#: The scenes of LLFF that Table 1 is the mean of.
+#: The scenes of LLFF in the means of Table 1.
 _LLFF = frozenset({"fern", "flower", "fortress", "horns", "orchids", "room", "trex"})
 
 
@@ -59,9 +59,9 @@ class _Column(NamedTuple):
 
     title: str
     scenes: frozenset[str]
-    """The scenes of Table 1; for Table 2 the paper's scene, and the one in its place here."""
+    """The scenes of Table 1; for Table 2 the paper's scene and our substitute for it."""
     changes: Mapping[str, float]
-    """Changes in percent by the metric's name."""
+    """Name of a metric -> its change, %."""
 
 
 _TABLE_1 = _Column(
@@ -104,7 +104,7 @@ _TABLE_2 = (
 )
 
 
-#: Metrics that the paper has a number of, and why ours is of another quantity.
+#: Metrics of the paper that measure another quantity here -> the reason.
 _NOT_COMPARABLE = {
     "memory_bytes": "the paper probably has gsplat's number, which is what torch allocates on the"
     " GPU, without the photographs; here every tensor that training holds is counted"
@@ -112,14 +112,16 @@ _NOT_COMPARABLE = {
 
 
 def why_no_table(labels: Iterable[str], scenes: Iterable[str]) -> str:
-    """Say why a sweep of full XR-GS has no table beside Table 1; empty where it has, or none of it.
+    """Say why a sweep of full XR-GS has no table beside Table 1; empty if it has one.
+
+    It is empty too if the sweep has no full XR-GS or no scene of Table 1.
 
     Args:
         labels: The labels of the sweep's cells.
-        scenes: The names of its scenes.
+        scenes: The names of the sweep's scenes.
     """
-    own = sorted({*scenes})
-    others, of_llff = [s for s in own if s not in _LLFF], [s for s in own if s in _LLFF]
+    names = sorted({*scenes})
+    others, of_llff = [s for s in names if s not in _LLFF], [s for s in names if s in _LLFF]
     if not (others and of_llff) or {*labels}.isdisjoint(_READINGS):
         return ""
     return (
@@ -132,8 +134,8 @@ def paper_tables(comparison: Comparison, contexts: Mapping[str, Context]) -> lis
     """Return the paper's tables beside the changes of full XR-GS from the baseline.
 
     Returns:
-        A table for each condition and column of the paper with scenes that the comparison has. None
-        where no label is full XR-GS, or the changes are from another label than the baseline.
+        A table for each condition and each column of the paper whose scenes the comparison has;
+        empty if no label is full XR-GS, or the base is not the baseline.
     """
     if comparison.base != BASELINE:
         return []
@@ -174,19 +176,19 @@ def _beside(
     scene: str,
     context: str,
 ) -> TextTable:
-    """Return a column of the paper beside the changes of a scene; of no scene, means over all."""
+    """Compare a column of the paper with a scene's changes, or their mean if `scene` is empty."""
     scenes = 1 if scene else len(comparison.scenes)
     rows = [
-        _row(label, metric, column.changes[metric.name], found, scenes)
+        _row(label, metric, column.changes[metric.name], row, scenes)
         for label in _READINGS
         for metric in comparison.metrics
         if metric.name in column.changes
-        and (found := changes.get((label, condition, metric.name))) is not None
+        and (row := changes.get((label, condition, metric.name))) is not None
     ]
-    of = scene or f"mean over {counted(scenes, 'scene')}"
+    extent = scene or f"mean over {counted(scenes, 'scene')}"
     metrics = [metric for metric in comparison.metrics if metric.name in column.changes]
     table = TextTable(
-        title=titled(f"Beside {column.title}: {of}", condition),
+        title=titled(f"Beside {column.title}: {extent}", condition),
         columns=(
             *("XR-GS", "Metric", "paper, %", "here, %", "95 % interval"),
             *("here / paper", "same sign (p)", "the paper's sign is"),
@@ -207,32 +209,32 @@ def _beside(
     return filled(table)
 
 
-def _row(label: str, metric: Metric, paper: float, found: Change, scenes: int) -> tuple[str, ...]:
+def _row(label: str, metric: Metric, paper: float, row: Change, scenes: int) -> tuple[str, ...]:
     comparable = metric.name not in _NOT_COMPARABLE
     return (
         label,
         metric.label,
         pointed(paper, metric),
-        f"{pointed(found.change, metric)}{lacking(found, scenes)}",
-        interval(found.low, found.high),
-        f"{found.change / paper:.2f}" if comparable and not math.isnan(found.change) else "",
-        same_sign(found),
-        _verdict(found, paper) if comparable else "not comparable",
+        f"{pointed(row.change, metric)}{lacking(row, scenes)}",
+        interval(row.low, row.high),
+        f"{row.change / paper:.2f}" if comparable and not math.isnan(row.change) else "",
+        same_sign(row),
+        _verdict(row, paper) if comparable else "not comparable",
     )
 
 
-def _verdict(found: Change, paper: float) -> str:
-    """Say whether a change has the sign of the paper's: `confirmed`, `refuted` or `open`."""
-    if math.isnan(found.low) or found.n < MIN_VALUES or found.low <= 0 <= found.high:
+def _verdict(row: Change, paper: float) -> str:
+    """Compare the sign of a change with the paper's: `confirmed`, `refuted` or `open`."""
+    if math.isnan(row.low) or row.n < MIN_VALUES or row.low <= 0 <= row.high:
         return "open"
-    return "confirmed" if (found.change > 0) == (paper > 0) else "refuted"
+    return "confirmed" if (row.change > 0) == (paper > 0) else "refuted"
 
 
 _PHOTOGRAPH = ["variant_id", "split", "view"]
 
 
 def with_texture(store: ReportStore, cells: pd.DataFrame, views: pd.DataFrame) -> pd.DataFrame:
-    """Return the scores of views with the texture of each view's photograph.
+    """Add the texture of each view's photograph to the scores of views.
 
     Args:
         store: The stores that have the variants.
@@ -240,8 +242,8 @@ def with_texture(store: ReportStore, cells: pd.DataFrame, views: pd.DataFrame) -
         views: `Sweep.views`.
 
     Returns:
-        The views, with `texture` in intensity per px of the photograph. It is NaN where the
-        photograph was removed on purpose or can't be read.
+        The views with a column `texture`, in intensity (0..1) per px of the photograph; NaN if the
+        photograph was trimmed or can't be read.
     """
     scored = cells.drop_duplicates("cell_id").set_index("cell_id")[["variant_id", "validation"]]
     rows = views.join(scored, on="cell_id")
@@ -249,12 +251,12 @@ def with_texture(store: ReportStore, cells: pd.DataFrame, views: pd.DataFrame) -
     photographs = rows[_PHOTOGRAPH].drop_duplicates()
     bar = progress(photographs.to_numpy(), "reading photographs", "photograph", len(photographs))
     photographs["texture"] = [_texture_of(store, *photograph) for photograph in bar]
-    found = rows.merge(photographs, on=_PHOTOGRAPH, how="left")["texture"]
-    return views.assign(texture=found.to_numpy(np.float64))
+    textures = rows.merge(photographs, on=_PHOTOGRAPH, how="left")["texture"]
+    return views.assign(texture=textures.to_numpy(np.float64))
 
 
 def _texture_of(store: ReportStore, variant_id: str, split: str, view: str) -> float:
-    """Return the texture of one photograph; NaN where it can't be read."""
+    """Return the texture of one photograph; NaN if it can't be read."""
     try:
         variant = store.variant(variant_id)
         check_images(variant.parent, variant.name)
@@ -267,17 +269,17 @@ def _texture_of(store: ReportStore, variant_id: str, split: str, view: str) -> f
 
 
 def texture(image: NDArray[np.float32], mask: NDArray[np.bool_] | None = None) -> float:
-    """Return the mean magnitude of an image's gradient, in intensity per px.
+    """Return the mean magnitude of an image's gradient, in intensity (0..1) per px.
 
-    It is `xrgs.training.components.texture.mean_gradient`, always without the last row and column,
-    which repeat others there. That function needs torch; this one does not.
+    It is `xrgs.training.components.texture.mean_gradient` without torch, and without the last row
+    and column, which are repeated there.
 
     Args:
         image: [H, W, 3] in 0..1.
         mask: [H, W], True for a pixel that is used; None uses all.
 
     Returns:
-        The mean over the pixels, at most sqrt(2); NaN where there is none.
+        The mean over the used pixels, at most sqrt(2); NaN if there is none.
     """
     if min(image.shape[:2]) < 2:
         return math.nan
@@ -292,17 +294,16 @@ def texture(image: NDArray[np.float32], mask: NDArray[np.bool_] | None = None) -
 def texture_tables(
     comparison: Comparison, views: pd.DataFrame, contexts: Mapping[str, Context]
 ) -> list[TextTable]:
-    """Return a table for each condition that has at least three scenes of known texture.
+    """Return tables of changes by texture, for conditions with at least three scenes.
 
     Args:
         comparison: The pairs of cells.
-        views: What `with_texture` returns.
+        views: The table that `with_texture` returns.
         contexts: How the cells of each condition were trained and scored.
 
     Returns:
-        Tables with a row for each ablation and score: the change of each scene, from the
-        least textured scene to the most textured one, and Spearman's rank correlation of texture
-        and change.
+        Tables with a row for each ablation and score: the change of each scene, the least textured
+        scene first, and Spearman's rank correlation of texture and change.
     """
     keys = comparison.cells.drop_duplicates("cell_id")[["cell_id", "condition", "scene"]]
     rows = views[["cell_id", "view", "texture"]].merge(keys, on="cell_id")
@@ -318,7 +319,7 @@ def texture_tables(
 def _by_texture(
     comparison: Comparison, contexts: Mapping[str, Context], condition: str, scenes: pd.Series
 ) -> TextTable:
-    """Return the table of a condition; `scenes` has its textures by scene, in rising order."""
+    """Return the table of a condition; `scenes` maps each scene to its texture, in rising order."""
     per_scene = by_key(comparison.per_scene)
     rows: list[tuple[str, ...]] = []
     metrics = [metric for metric in comparison.metrics if metric.score is not None]
@@ -347,11 +348,11 @@ def _by_texture(
 
 
 def _rank_correlation(textures: pd.Series, changes: pd.Series) -> str:
-    """Write the rank correlation over the scenes that have a change; empty of too few or equal."""
-    known = changes.notna()
-    if known.sum() < MIN_VALUES or changes[known].nunique() < 2 or textures[known].nunique() < 2:
+    """Write the rank correlation over scenes with a change; empty for too few or equal values."""
+    valid = changes.notna()
+    if valid.sum() < MIN_VALUES or changes[valid].nunique() < 2 or textures[valid].nunique() < 2:
         return ""
-    return signed(textures[known].corr(changes[known], method="spearman"))
+    return signed(textures[valid].corr(changes[valid], method="spearman"))
 
 
 class _Figure(NamedTuple):
@@ -360,9 +361,9 @@ class _Figure(NamedTuple):
     name: str
     shows: str
     ablation: str
-    """The ablation that it shows, by its name in `conf/ablation/`."""
+    """Name of the shown ablation in `conf/ablation/`."""
     scenes: tuple[str, ...]
-    """The scene that it shows, and what it may be called here; empty for any."""
+    """Names that the shown scene may have here; empty for any scene."""
     tag: str
     """`LR` or `HR` for a training view; empty for a test view."""
 
@@ -410,16 +411,16 @@ _FIGURES = (
 
 @dataclass(frozen=True)
 class Counterpart:
-    """What the page has for a figure of the paper."""
+    """The view on the page that corresponds to a figure of the paper."""
 
     name: str
     shows: str
     here: str
-    """The view that the page shows, or why it shows none."""
+    """The name of the view, or why there is none."""
     section: str = ""
-    """`views` or `training` where the page has it."""
+    """The section of the page with the view, `views` or `training`; empty without a view."""
     place: int = 0
-    """The entry of that part of the content."""
+    """The index of the view in that section."""
     label: str = ""
     """The ablation to select there."""
 
@@ -427,15 +428,15 @@ class Counterpart:
 def counterparts(
     labels: Iterable[str], views: Sequence[dict[str, Any]], training: Sequence[dict[str, Any]]
 ) -> list[Counterpart]:
-    """Find for each figure of the paper what the page of a report shows of it.
+    """Find the view on a report's page that corresponds to each figure of the paper.
 
     Args:
-        labels: The ablations, as the page shows them.
+        labels: The labels of the page's ablations.
         views: The test views of the page, `xrgs.report.html.content.Content.views`.
-        training: Its training views.
+        training: The training views of the page, `Content.training`.
     """
-    known = set(labels)
-    return [_counterpart(figure, training if figure.tag else views, known) for figure in _FIGURES]
+    names = set(labels)
+    return [_counterpart(figure, training if figure.tag else views, names) for figure in _FIGURES]
 
 
 def _counterpart(
@@ -452,9 +453,9 @@ def _counterpart(
     ]
     if not fitting:
         return Counterpart(figure.name, figure.shows, "the page has no picture of it, see below")
-    own = [place for place in fitting if entries[place]["scene"] in figure.scenes]
-    place = (own or fitting)[0]
-    found = entries[place]
-    here = f"{found['scene']}, view {found['view']}, {figure.ablation}"
+    same_scene = [place for place in fitting if entries[place]["scene"] in figure.scenes]
+    place = (same_scene or fitting)[0]
+    shown = entries[place]
+    here = f"{shown['scene']}, view {shown['view']}, {figure.ablation}"
     section = "training" if figure.tag else "views"
     return Counterpart(figure.name, figure.shows, here, section, place, figure.ablation)

@@ -1,4 +1,4 @@
-"""What became of the photographs of each scene, and what trainings found out about them."""
+"""Notes on each scene's photographs: how they were placed, what was left out or measured."""
 
 from __future__ import annotations
 
@@ -16,39 +16,39 @@ if TYPE_CHECKING:
     from xrgs.report.collect import Sweep
     from xrgs.report.joined import ReportStore
 
-#: The most names in a sentence on views that are not placed: all that a scene is likely to have.
+#: The most names in a sentence on views that are not placed.
 _MAX_NAMES = 200
 
 
 def with_variants(sweep: Sweep, store: ReportStore) -> Sweep:
-    """Return a sweep with the reports of its finished cells' variants.
+    """Return a sweep with the SfM reports of its finished cells' variants.
 
-    A variant whose report can't be read has a report that says so.
+    If a report can't be read, its note says so.
     """
     done = sweep.cells[sweep.cells["cell_id"].isin(sweep.done)]
-    found = {}
+    reports = {}
     for variant_id in done["variant_id"].unique():
         try:
-            found[variant_id] = store.variant_report(variant_id)
+            reports[variant_id] = store.variant_report(variant_id)
         except StoreError as error:
             why = store.without_paths(str(error))
-            found[variant_id] = SfmReport(notes=(f"not known, what became of them: {why}",))
-    return replace(sweep, variants=found)
+            reports[variant_id] = SfmReport(notes=(f"unknown what was done with them: {why}",))
+    return replace(sweep, variants=reports)
 
 
 def photographs(sweep: Sweep) -> list[tuple[str, tuple[str, ...]]]:
-    """Return the name of each scene with finished cells, and sentences on its photographs.
+    """Return (scene, sentences on its photographs) for the scenes with finished cells.
 
-    A scene has several variants where HR views are drawn more than once. What a training found
-    (blur, exposure) comes after the label of its cell.
+    The sentences come from all variants of the scene, and from its cells' trainings (blur,
+    exposure) with the cell's label.
     """
     done = sweep.cells[sweep.cells["variant_id"].isin(sweep.variants)]
-    found = []
+    by_scene = []
     for scene, rows in done.groupby("scene", sort=False):
         variants = [sweep.variants[name] for name in rows["variant_id"].unique()]
         notes = [note for variant in variants for note in variant.all_notes(_MAX_NAMES)]
-        found.append((str(scene), tuple(dict.fromkeys([*notes, *_found(sweep, rows)]))))
-    return [(scene, notes) for scene, notes in found if notes]
+        by_scene.append((str(scene), tuple(dict.fromkeys([*notes, *_findings(sweep, rows)]))))
+    return [(scene, notes) for scene, notes in by_scene if notes]
 
 
 def placement(sweep: Sweep, scene: str) -> str:
@@ -56,7 +56,7 @@ def placement(sweep: Sweep, scene: str) -> str:
     rows = sweep.cells[(sweep.cells["scene"] == scene)]
     reports = [sweep.variants[name] for name in rows["variant_id"] if name in sweep.variants]
     if not reports or not reports[0].images:
-        return "not known, how the photographs were placed"
+        return "it is unknown how the photographs were placed"
     report = reports[0]
     by = "structure from motion" if report.poses is None else "the cameras that were given"
     error = report.reprojection_error_px
@@ -66,8 +66,8 @@ def placement(sweep: Sweep, scene: str) -> str:
     return ", ".join(parts)
 
 
-def _found(sweep: Sweep, rows: pd.DataFrame) -> Iterator[str]:
-    """Yield what the cells of a scene found, behind their labels and, if several, replicates."""
+def _findings(sweep: Sweep, rows: pd.DataFrame) -> Iterator[str]:
+    """Yield the findings of a scene's trainings, each with its label and replicate."""
     replicates = len(rows[["variant_seed", "seed"]].drop_duplicates())
     for row in rows[rows["cell_id"].isin(sweep.done)].to_dict("records"):
         replicate = f"replicate {row['variant_seed']}/{row['seed']}" * (replicates > 1)

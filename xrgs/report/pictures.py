@@ -44,24 +44,24 @@ if TYPE_CHECKING:
 
     _Drawing = Callable[[Path], "Picture"]  # draws into the file
 
-#: The scores that are drawn over time.
+#: The scores in figures over training time.
 _QUALITY = ("psnr", "lpips")
 _QUALITY_TITLE = "Quality during training: scenes thin, mean thick, level where {base} ends"
-#: The metrics that are drawn over a setting.
+#: The metrics in figures over a setting.
 _DEPENDENT = frozenset({"gaussians", "lpips", "ssim", "psnr"})
 _SENSITIVITY_TITLE = (
     "Change from {base} over {key}: replicates as dots, scenes thin, mean thick, better is up"
 )
 _CURVES = {"gaussians": "Gaussians", "loss": "loss of the step's view, as each run weighs it"}
-#: The most pixels of an image: three are in memory at a time, with 12 bytes a pixel, and are drawn.
+#: The most pixels of an image: a figure needs three in memory, at 12 bytes a pixel.
 _MAX_PIXELS = 1 << 24
-#: The most pictures that are drawn without being asked for by name; each takes up to a second.
+#: The most pictures that are drawn unless they are named; each takes up to a second.
 _MAX_PICTURES = 40
-#: The fewest values of a setting that show how a change depends on it.
+#: A setting needs at least this many values for a figure over it.
 _MIN_SETTINGS = 3
-#: The largest value of a setting that an axis can show: the space beside it needs more of float64.
+#: The largest value of a setting on an axis, whose margins must be finite in float64, too.
 _MAX_SETTING = 1e100
-#: The most ablations that one figure of trade-offs can name.
+#: The most ablations in a figure of trade-offs, which lists their names.
 _MAX_ABLATIONS = 200
 
 
@@ -84,10 +84,10 @@ def draw(
 ) -> list[Picture]:
     """Draw the pictures of a report.
 
-    Each condition has the trade-offs of its ablations where there are several, and quality during
-    training where it was evaluated. Each setting that has three values has changes over it. Each
-    scene and ablation has views and training curves of the first condition and replicate, which
-    the titles name.
+    For each condition: the trade-offs of its ablations if there are several, and quality during
+    training if it was evaluated. For each setting with at least three values: the changes over it.
+    For each scene and ablation: views and training curves of the first condition and replicate,
+    which the titles name.
 
     Args:
         store: The stores with the photographs, renders and histories.
@@ -95,8 +95,7 @@ def draw(
         views: The table `Sweep.views`.
         quality: The table that `xrgs.report.curves.joined` returns.
         folder: The existing folder to write the files to.
-        names: File names without suffix of the pictures to draw; None draws all, but no more than
-            the first 40.
+        names: File names without suffix of the pictures to draw; None draws the first 40.
 
     Returns:
         The pictures, in the order of the tables.
@@ -132,7 +131,7 @@ def draw(
 
 
 def _same_views(base: pd.Series | None, ablation: pd.Series | None) -> tuple[pd.Series, pd.Series]:
-    """Return the PSNR of the views that both cells have, in their order; empty without any."""
+    """Return the PSNR of both cells, dB, for the views that both have; empty if there is none."""
     if base is None or ablation is None:
         return pd.Series(dtype=float), pd.Series(dtype=float)
     both = ablation.index[ablation.index.isin(base.index)]
@@ -169,13 +168,13 @@ def _trade_offs(comparison: Comparison) -> dict[str, _Drawing]:
 def _sensitivities(comparison: Comparison) -> dict[str, _Drawing]:
     """Return the figures of changes over each swept setting.
 
-    All curves of a setting are on one figure. Where there are more than a figure can tell apart,
-    each ablation has a figure of its own.
+    All curves of a setting share a figure, unless there are `MAX_ARMS` or more: then each ablation
+    has its own.
     """
     drawings: dict[str, _Drawing] = {}
     for key, changes in sensitivities(comparison).items():
-        known = set(changes.dropna(subset="change")["metric"])
-        axes = [metric for metric in comparison.metrics if metric.name in known & _DEPENDENT]
+        names = set(changes.dropna(subset="change")["metric"])
+        axes = [metric for metric in comparison.metrics if metric.name in names & _DEPENDENT]
         if not axes:
             continue
         parts = {"": changes}
@@ -194,31 +193,30 @@ def _sensitivities(comparison: Comparison) -> dict[str, _Drawing]:
 def sensitivities(comparison: Comparison) -> dict[str, pd.DataFrame]:
     """Return how the changes depend on each numeric setting that was swept.
 
-    The label of an ablation has the value of a setting that only the ablation has, as in
-    `consistency.weight=0.05`. The condition has the value of a setting that the base has too, as
-    in `variant.factor=2 variant.hr_fraction=0.1`.
+    The values are read from labels, for a setting of the ablation (`consistency.weight=0.05`), and
+    from conditions, for a setting that the base has too (`variant.factor=2`).
 
     Args:
         comparison: The pairs of cells and their means.
 
     Returns:
-        By the setting's key, for each that has at least three values: one row for each change,
-        with `level` (`pair`, `scene` or `mean`), `scene` (missing for a mean), `metric`, `change`,
-        `value` (of the setting), `ablation` (the rest of the label) and `series` (the rest of label
-        and condition: each is a curve).
+        Key of a setting with at least three values -> one row for each change: `level` (`pair`,
+        `scene` or `mean`), `scene` (missing for a mean), `metric`, `change`, `value` (of the
+        setting), `ablation` (the label without the setting) and `series` (label and condition
+        without the setting; each series is a curve).
     """
     changes = _changes(comparison)
-    found = {}
+    by_key = {}
     for key, places in _settings(comparison.groups).items():
         rows = changes.merge(places, on=["label", "condition"])
         values = rows.groupby("series")["value"].transform("nunique")
         if (values >= _MIN_SETTINGS).any():
-            found[key] = rows[values >= _MIN_SETTINGS].sort_values("value", kind="stable")
-    return found
+            by_key[key] = rows[values >= _MIN_SETTINGS].sort_values("value", kind="stable")
+    return by_key
 
 
 def _changes(comparison: Comparison) -> pd.DataFrame:
-    """Return the changes of pairs, of scenes and of the means in one table, as tables show them."""
+    """Return the changes of pairs, of scenes and of the means in one table, in dB or %."""
     pairs = comparison.pairs
     ratios = {metric.name for metric in comparison.metrics if is_ratio(metric)}
     shown = np.where(pairs["metric"].isin(ratios), 100 * np.expm1(pairs["effect"]), pairs["effect"])
@@ -233,11 +231,13 @@ def _changes(comparison: Comparison) -> pd.DataFrame:
 
 
 def _settings(groups: Iterable[tuple[str, str]]) -> dict[str, pd.DataFrame]:
-    """Return the numeric settings of labels and conditions: by the key, a row for each that has it.
+    """Read the numeric settings in labels and conditions.
 
-    A row has `label`, `condition`, and `value`, `ablation` and `series` of `sensitivities`.
+    Returns:
+        Key of a setting -> one row for each (label, condition) with the setting: `label`,
+        `condition`, and `value`, `ablation` and `series` of `sensitivities`.
     """
-    found: dict[str, list[tuple[str, str, float, str, str]]] = {}
+    by_key: dict[str, list[tuple[str, str, float, str, str]]] = {}
     for label, condition in groups:
         words = f"{label} {condition}".strip().split(" ")
         label_words = label.count(" ") + 1
@@ -247,13 +247,13 @@ def _settings(groups: Iterable[tuple[str, str]]) -> dict[str, pd.DataFrame]:
                 rest = words[:at] + words[at + 1 :]
                 ablation = rest[: label_words - (at < label_words)]
                 row = (label, condition, value, " ".join(ablation), " ".join(rest))
-                found.setdefault(key, []).append(row)
+                by_key.setdefault(key, []).append(row)
     columns = ["label", "condition", "value", "ablation", "series"]
-    return {key: pd.DataFrame(rows, columns=columns) for key, rows in found.items()}
+    return {key: pd.DataFrame(rows, columns=columns) for key, rows in by_key.items()}
 
 
 def _number(text: str) -> float:
-    """Return the number of a text; NaN where the text is not a number."""
+    """Convert a text to a number; NaN if it is none."""
     try:
         return float(text)
     except ValueError:
@@ -261,10 +261,10 @@ def _number(text: str) -> float:
 
 
 def _absolute(comparison: Comparison, condition: str) -> pd.DataFrame:
-    """Return Gaussians and measured scores of each label and scene, as means over its runs.
+    """Return the mean Gaussians and scores of each label and scene.
 
-    The index is the label, and the base comes first. A cell that lacks a score or has no finished
-    base has no row; the tables say why.
+    The index is the label, and the base comes first. Cells that lack a score or a finished base are
+    left out; the tables say why.
     """
     cells = comparison.cells
     chosen = cells[(cells["condition"] == condition) & (cells["reason"] == "")]
@@ -277,11 +277,11 @@ def _absolute(comparison: Comparison, condition: str) -> pd.DataFrame:
 
 
 def _base_first(rows: pd.DataFrame, base: str) -> pd.DataFrame:
-    return rows.sort_values("label", key=lambda of: of != base, kind="stable")
+    return rows.sort_values("label", key=lambda labels: labels != base, kind="stable")
 
 
 def _curves_of_quality(comparison: Comparison, curves: pd.DataFrame) -> dict[str, _Drawing]:
-    """Return figures of the quality during training: the base and seven ablations on each."""
+    """Return figures of the quality during training, each with the base and seven ablations."""
     metrics = {metric.name: metric for metric in comparison.metrics}
     drawings: dict[str, _Drawing] = {}
     for condition in dict.fromkeys(curves["condition"]):
@@ -325,7 +325,7 @@ def median_view(base: pd.Series, ablation: pd.Series) -> str:
         ablation: PSNR of the ablation in dB, indexed by view.
 
     Returns:
-        The name of the view; of an even number of views, the lower of the two in the middle.
+        The name of the view; for an even number of views, the lower of the two in the middle.
     """
     change = (ablation - base.reindex(ablation.index)).fillna(0.0).sort_index()
     return str(change.sort_values(kind="stable").index[(len(change) - 1) // 2])

@@ -40,18 +40,18 @@ if TYPE_CHECKING:
     from xrgs.report.compare import Comparison
     from xrgs.report.context import Context
 
-#: Metrics that differ each time the same training is run.
+#: Metrics that differ between two runs of the same training.
 _NOISY = frozenset({"training_time_s", "render_time_ms", "peak_rss_bytes"})
-#: The longest reason in a cell of a table, in characters.
+#: The longest reason inside a table, in characters.
 _MAX_REASON = 100
-#: The most replicates that a title lists; it has the number of more.
+#: The most replicates that a title lists; of more it says only the number.
 _MAX_LISTED = 8
 #: The order of the scores in a compact table and the arrows in its heads, as in papers.
 _PAPER_ORDER = {"psnr": 0, "ssim": 1, "lpips": 2}
 _DIRECTION = {True: "↑", False: "↓"}
 #: Keys of a row of the long table.
 _LEVEL = ["level", "label", "condition", "scene", "metric"]
-#: Columns of the long table with the share of the gap to all_hr, by their names in the averages.
+#: Names in the averages -> columns of the long table, for the share of the gap that is closed.
 _GAP = {"change": "gap_closed_percent", "low": "gap_low", "high": "gap_high", "why": "gap_why"}
 
 
@@ -61,7 +61,7 @@ class Tables:
     Args:
         comparison: The pairs of cells and their means.
         contexts: How the cells of each condition were trained and scored.
-        notes: Sentences under the table of a label and a condition.
+        notes: (label, condition) -> sentences under its table.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class Tables:
 
     @cached_property
     def _replicates(self) -> dict[tuple[str, str, str], set[tuple[int, int]]]:
-        """The replicates (variant.seed, seed) of the pairs, by (label, condition, scene)."""
+        """(label, condition, scene) -> the replicates (variant.seed, seed) of its pairs."""
         pairs = self.comparison.pairs
         keys = zip(pairs["label"], pairs["condition"], pairs["scene"], strict=True)
         replicates: dict[tuple[str, str, str], set[tuple[int, int]]] = {}
@@ -105,7 +105,7 @@ class Tables:
         return [s for s in self.comparison.scenes if (label, condition, s) in self._replicates]
 
     def overviews(self) -> list[TextTable]:
-        """Return a table of all ablations for each condition that has several."""
+        """Return a table of all ablations for each condition with several ablations."""
         overviews = []
         for condition in dict.fromkeys(condition for _, condition in self.comparison.groups):
             labels = [name for name, other in self.comparison.groups if other == condition]
@@ -137,21 +137,21 @@ class Tables:
         )
 
     def unchanged(self, label: str, condition: str) -> str:
-        """Say why an ablation has nothing to compare: it is the base, or gave the same results.
+        """Say why an ablation has nothing to compare: its cells or results are those of the base.
 
         Returns:
-            The end of a sentence that begins with the label; empty where something changed. Times
-            and the memory of the process differ in every run, and don't count.
+            The end of a sentence that begins with the label; empty if something changed. Times and
+            the memory of the process don't count, since they differ in every run.
         """
         pairs, base = self.comparison.pairs, self.comparison.base
-        here = pairs[(pairs["label"] == label) & (pairs["condition"] == condition)]
-        if here.empty:
+        own_pairs = pairs[(pairs["label"] == label) & (pairs["condition"] == condition)]
+        if own_pairs.empty:
             return ""
-        if (here["cell_id"] == here["base_id"]).all():
+        if (own_pairs["cell_id"] == own_pairs["base_id"]).all():
             return f"changes nothing: its cells are the cells of {base}"
-        steady = here[~here["metric"].isin(_NOISY)]
-        known = steady[steady["base"].notna() | steady["value"].notna()]
-        if known.empty or not (known["base"] == known["value"]).all():
+        steady = own_pairs[~own_pairs["metric"].isin(_NOISY)]
+        measured = steady[steady["base"].notna() | steady["value"].notna()]
+        if measured.empty or not (measured["base"] == measured["value"]).all():
             return ""
         return f"changes nothing: its scores, counts and amounts of work are those of {base}"
 
@@ -159,7 +159,7 @@ class Tables:
         """Return the changes of one ablation, with values, intervals and verdicts."""
         base, scenes = self.comparison.base, len(self.scenes_of(label, condition))
         keys = ((label, condition, metric.name) for metric in self.comparison.metrics)
-        found = [
+        changes = [
             (self._means[key], metric)
             for key, metric in zip(keys, self.comparison.metrics, strict=True)
             if key in self._means
@@ -167,8 +167,8 @@ class Tables:
         title = titled(f"{label} against {base}: {self._extent(label, condition)}", condition)
         if why := self.unchanged(label, condition):
             return TextTable(title, ("Result",), ((f"{label} {why}",),), "l")
-        # What holds of every row is said once.
-        alone = NO_INTERVAL if all(math.isnan(row.low) for row, _ in found) else ""
+        # A verdict that all rows share is said once, in the context.
+        shared = NO_INTERVAL if all(math.isnan(row.low) for row, _ in changes) else ""
         corrected = "p (Holm)" if label in self.comparison.design.headline else "q"
         table = TextTable(
             title=title,
@@ -176,24 +176,24 @@ class Tables:
                 *("Metric", base, label, "change", "95 % interval", "new scene"),
                 *("same sign (p)", corrected, "verdict"),
             ),
-            rows=tuple(_mean_row(row, metric, scenes, alone) for row, metric in found),
+            rows=tuple(_mean_row(row, metric, scenes, shared) for row, metric in changes),
             align="lrrrrrrrl",
             notes=(
                 *(*self._context(condition).cautions, *self._notes.get((label, condition), ())),
                 *(
                     f"{metric.label}: pairs left out ({row.why})"
-                    for row, metric in found
+                    for row, metric in changes
                     if row.why and not math.isnan(row.change)
                 ),
                 *self._mixed_note(label, condition),
             ),
-            context="; ".join(filter(None, (alone, self._context(condition).of_all))),
+            context="; ".join(filter(None, (shared, self._context(condition).of_all))),
             name=f"{label} {condition}".strip(),
         )
         return filled(table)
 
     def _extent(self, label: str, condition: str) -> str:
-        """Say how many scenes and which replicates a mean is over."""
+        """Name the number of scenes and the replicates of a mean."""
         scenes = self.scenes_of(label, condition)
         replicates = {one for s in scenes for one in self._replicates[label, condition, s]}
         of = "" if len(scenes) == len(self.comparison.scenes) else (
@@ -203,7 +203,7 @@ class Tables:
         return f"{names}, {_listed(replicates)}"
 
     def _mixed_note(self, label: str, condition: str) -> tuple[str, ...]:
-        """Say that intervals mix two kinds of scatter, where several scenes have one replicate."""
+        """Return a note for several scenes with one replicate each: intervals mix both scatters."""
         scenes = self.scenes_of(label, condition)
         counts = {len(self._replicates[label, condition, s]) for s in scenes}
         if counts != {1} or len(scenes) < 2:
@@ -211,16 +211,16 @@ class Tables:
         return ("one replicate a scene: differences of runs and of scenes are mixed",)
 
     def per_scene(self, label: str, condition: str) -> TextTable:
-        """Return a table with one column for each scene, failed ones too, and their mean."""
+        """Return a table with a column for each scene, including failed ones, and their mean."""
         scenes = self.comparison.scenes
         rows: list[tuple[str, ...]] = []
         for metric in () if self.unchanged(label, condition) else self.comparison.metrics:
-            found = [self._per_scene.get((label, condition, s, metric.name)) for s in scenes]
+            changes = [self._per_scene.get((label, condition, s, metric.name)) for s in scenes]
             mean = self._means.get((label, condition, metric.name))
-            if not any(found):  # nothing is done: `missing` says why
+            if not any(changes):  # no cell is done: see the table `missing`
                 continue
             cells = [
-                *(MISSING if row is None else pointed(row.change, metric) for row in found),
+                *(MISSING if row is None else pointed(row.change, metric) for row in changes),
                 marked(mean, metric, len(scenes)),
             ]
             rows.append((named(metric), *cells))
@@ -235,9 +235,9 @@ class Tables:
         )
 
     def values(self, condition: str) -> TextTable:
-        """Return a table of each label's own values, means over the replicates that are done.
+        """Return a table of each label's values, means over the done replicates.
 
-        A scene without a cell that is done has no rows: `missing` says why.
+        A scene without a done cell has no rows: see the table `missing`.
         """
         cells = self.comparison.cells
         done = cells[(cells["state"] == "done") & (cells["condition"] == condition)]
@@ -247,9 +247,9 @@ class Tables:
         rows = []
         for scene in sorted(done["scene"].unique()):
             for metric in self.comparison.metrics:
-                found = [means.get((scene, label)) for label in labels]
+                numbers = [means.get((scene, label)) for label in labels]
                 texts = [MISSING if v is None else number(v[metric.name], metric.unit)
-                         for v in found]  # fmt: skip
+                         for v in numbers]  # fmt: skip
                 rows.append((scene, metric.label, *texts))
         return TextTable(
             title=titled("Values, means over the replicates that are done", condition),
@@ -262,10 +262,10 @@ class Tables:
         )
 
     def scores(self, condition: str) -> TextTable:
-        """Return the compact table of papers: a row for each method, the scores scene by scene.
+        """Return a compact table as in papers: a row for each method, the scores scene by scene.
 
-        The scores are means over the replicates that are done. With several scenes there is a mean
-        over all of them, n/a for a method that lacks one. The best of each column is bold.
+        The scores are means over the done replicates. With several scenes there is a mean over all
+        of them, n/a for a method that lacks one. The best of each column is bold.
         """
         cells = self.comparison.cells
         here = cells[cells["condition"] == condition]
@@ -304,16 +304,16 @@ class Tables:
         )  # fmt: skip
 
     def _scores(self) -> list[Metric]:
-        """Return the scores of views, in the order of papers."""
-        known = [metric for metric in self.comparison.metrics if metric.score is not None]
-        return sorted(known, key=lambda metric: _PAPER_ORDER.get(metric.name, len(_PAPER_ORDER)))
+        """Return the metrics that score views, in the order of papers."""
+        scores = [metric for metric in self.comparison.metrics if metric.score is not None]
+        return sorted(scores, key=lambda metric: _PAPER_ORDER.get(metric.name, len(_PAPER_ORDER)))
 
     def gaps(self) -> list[TextTable]:
-        """Return a table for each condition that has all_hr and another ablation.
+        """Return a table of shares of the gap for each condition with all_hr and another ablation.
 
         It has a row for each ablation and score: the share of the gap in percent, scene by scene
         and in the mean over scenes, with its interval and sign test. Notes say why a scene has no
-        share, or a mean leaves out some of its pairs.
+        share, or why pairs are left out of a mean.
         """
         means, per_scene = by_key(self.comparison.gaps), by_key(self.comparison.gaps_per_scene)
         conditions = dict.fromkeys(condition for _, condition, _ in means)
@@ -328,18 +328,18 @@ class Tables:
         comparison, base, scenes = self.comparison, self.comparison.base, self.comparison.scenes
         labels = [name for name, of in comparison.groups if of == condition and name != ALL_HR]
         rows: list[tuple[str, ...]] = []
-        left_out: dict[str, list[str]] = {}  # each note, with the ablations that it is of
+        left_out: dict[str, list[str]] = {}  # note -> its ablations
         for label in labels:
             for metric in comparison.metrics:
                 mean = means.get((label, condition, metric.name))
                 if mean is None:
                     continue
-                found = [per_scene.get((label, condition, s, metric.name)) for s in scenes]
-                shares = [MISSING if row is None else signed(row.change) for row in found]
+                changes = [per_scene.get((label, condition, s, metric.name)) for s in scenes]
+                shares = [MISSING if row is None else signed(row.change) for row in changes]
                 shares.append(f"{signed(mean.change)}{lacking(mean, len(scenes))}")
                 bounds = interval(mean.low, mean.high)
                 rows.append((label, metric.label, *shares, bounds, same_sign(mean)))
-                for scene, row in zip(scenes, found, strict=True):
+                for scene, row in zip(scenes, changes, strict=True):
                     if row is not None and row.why:
                         what = "n/a" if math.isnan(row.change) else "pairs left out"
                         note = f"{metric.label}, {scene}: {what} ({row.why})"
@@ -363,9 +363,9 @@ class Tables:
         return filled(table)
 
     def missing(self) -> TextTable | None:
-        """Return a table of the cells without results and why; None where there are none.
+        """Return a table of the cells without results, with the reasons; None if all have some.
 
-        A long reason, as of a scene that COLMAP could not place, is a note below the table.
+        A long reason, such as COLMAP's for a scene without cameras, is a note below the table.
         """
         rows = self.comparison.missing()
         if rows.empty:
@@ -383,7 +383,7 @@ class Tables:
         )
 
     def long(self) -> pd.DataFrame:
-        """Return every change at full precision, one in each row, as in `table.csv`."""
+        """Return all changes at full precision, one in each row: the content of `table.csv`."""
         metrics = {metric.name: metric for metric in self.comparison.metrics}
         scenes = self.comparison.per_scene.reset_index()
         means = self.comparison.means.reset_index()
@@ -425,24 +425,24 @@ def _score(value: float, metric: Metric) -> str:
 
 
 def _best(values: list[float], metric: Metric) -> list[int]:
-    """Return which of the values are best as they are printed; none where there is only one."""
-    known = {_score(v, metric): v for v in values if not math.isnan(v)}
-    if len(known) < 2:
+    """Return the indices of the best values as printed; none if all are printed alike."""
+    by_text = {_score(v, metric): v for v in values if not math.isnan(v)}
+    if len(by_text) < 2:
         return []
-    best = (max if metric.higher_is_better else min)(known, key=lambda text: known[text])
+    best = (max if metric.higher_is_better else min)(by_text, key=lambda text: by_text[text])
     return [row for row, value in enumerate(values) if _score(value, metric) == best]
 
 
-def _mean_row(row: Change, metric: Metric, scenes: int, said: str) -> tuple[str, ...]:
+def _mean_row(row: Change, metric: Metric, scenes: int, shared: str) -> tuple[str, ...]:
     """Return the row of a change in the table of its ablation.
 
     Args:
         row: The change.
         metric: The metric that changed.
-        scenes: How many scenes the mean should be over.
-        said: A verdict that the table's context has, and that no row repeats.
+        scenes: Number of scenes that the mean should include.
+        shared: A verdict in the table's context, which rows don't repeat.
     """
-    read = verdict(row, metric)
+    own_verdict = verdict(row, metric)
     return (
         metric.label,
         number(row.base, metric.unit),
@@ -452,14 +452,14 @@ def _mean_row(row: Change, metric: Metric, scenes: int, said: str) -> tuple[str,
         interval(row.new_low, row.new_high),
         same_sign(row),
         p_value(row.p_corrected),
-        "" if read == said else read,
+        "" if own_verdict == shared else own_verdict,
     )
 
 
 def _listed(replicates: set[tuple[int, int]]) -> str:
-    """List the replicates of a mean, pairs (variant.seed, seed); count them where there are many.
+    """List the replicates (variant.seed, seed) of a mean, or count them if there are many.
 
-    They are named by `seed` alone where all have the same draw of HR views.
+    If all have the same `variant.seed`, only `seed` is listed.
     """
     if len(replicates) > _MAX_LISTED:
         return f"{len(replicates)} replicates"

@@ -1,9 +1,8 @@
-"""Tables of what each training did, what work it left out, and the cost of that work.
+"""Tables of the work of each training, the work that it skipped, and the cost of the skipped work.
 
 They show why a component changes nothing or makes results worse, and where a run saves time. Counts
-are of the history of a cell; the totals of `xrgs.training.work.StepWork` and the seconds of each
-stage are of its summary. The costs are estimated from the totals of the run itself, and not from
-another run.
+come from the history of a cell; the totals of `xrgs.training.work.StepWork` and the seconds of each
+stage from its summary. The cost of skipped work is estimated from the same run's totals.
 """
 
 from __future__ import annotations
@@ -38,20 +37,20 @@ _LABELS = {
     "skipped_shN": "Steps that did not move shN",
 }
 _NUMBERS = ["number", "share", "cost", "cost_share"]
-#: Counts of a history that begin so are of steps that left something out.
+#: Counts of a history with this prefix are numbers of steps that skipped something.
 _PREFIX = "skipped_"
 _UNKNOWN = "unknown"
 
 
 class _Kind(NamedTuple):
-    """A kind of work that a run can leave out."""
+    """A kind of work that a run can skip."""
 
     label: str
-    """Its name in the table, where `{base}` stands for the label of the base."""
+    """Name in the table; `{base}` is replaced by the label of the base."""
     unit: str
-    """Unit of the cost: `s`, `evaluations` (of alpha), or empty where nothing is known of it."""
+    """Unit of the cost: `s`, `evaluations` (of alpha), or empty if the cost is unknown."""
     estimate: str
-    """How the cost is estimated."""
+    """How the cost is estimated, for a note below the table."""
 
 
 _KINDS = {
@@ -93,16 +92,16 @@ _KINDS = {
 
 
 def totals(cells: pd.DataFrame, done: Mapping[str, DoneCell]) -> pd.DataFrame:
-    """Return what training did in each cell that is done.
+    """Return the counts of training in each done cell.
 
     Args:
         cells: The table `Comparison.cells`.
         done: The cells that are done, by their ids.
 
     Returns:
-        One row for each cell: `CELL_KEYS`, and a column for each count of its history (over the
-        whole training) and each value that a component logged (its mean over training); NaN where a
-        cell has none.
+        One row for each cell: `CELL_KEYS`, and a column for each count of its history (at the end
+        of training) and each value that a component logged (its mean over training); NaN for a cell
+        without it.
     """
     keys = cells.loc[cells["cell_id"].isin(done), CELL_KEYS].drop_duplicates("cell_id")
     keys = keys.reset_index(drop=True)
@@ -134,7 +133,7 @@ def totals_table(totals: pd.DataFrame, labels: Sequence[str], condition: str) ->
 
 
 def _ordered(totals: pd.DataFrame) -> list[str]:
-    """Return the columns of numbers: known ones, then the components', each in their own order."""
+    """Return the columns of numbers: those of `_LABELS`, others, then the components'."""
     numbers = [name for name in totals.columns if name not in CELL_KEYS]
     return sorted(numbers, key=lambda name: (name not in _LABELS, is_component_log(name)))
 
@@ -146,7 +145,7 @@ def _count(value: float | None, *, is_component_log: bool) -> str:
 
 
 def _work(cell: DoneCell) -> dict[str, float]:
-    """Return the totals of a cell: its summary's, and the counts of steps that skipped something.
+    """Return the totals of a cell: of its summary, and counts of steps that skipped something.
 
     Cells of older versions have no `work` and no seconds of stages.
     """
@@ -162,7 +161,7 @@ def _work(cell: DoneCell) -> dict[str, float]:
 
 
 def skipped(cells: pd.DataFrame, done: Mapping[str, DoneCell]) -> pd.DataFrame:
-    """Return what each cell left out.
+    """Return the work that each cell skipped.
 
     Args:
         cells: The table `Comparison.cells`.
@@ -170,22 +169,22 @@ def skipped(cells: pd.DataFrame, done: Mapping[str, DoneCell]) -> pd.DataFrame:
 
     Returns:
         One row for each cell and kind of work with known counts: `CELL_KEYS` and `kind`; the
-        `number` that was left out, and its `share` of what there was; its estimated `cost` in the
-        kind's `unit` (`s` or `evaluations`), and `cost_share` of what the run took itself. The
-        costs are NaN where they are not known.
+        skipped `number`, and its `share` of the total; the estimated `cost` of the skipped work in
+        the kind's `unit` (`s` or `evaluations`), and `cost_share`, the cost over that of the whole
+        run. The costs are NaN if unknown.
     """
     rows = []
     for _, cell in cells[cells["cell_id"].isin(done)].drop_duplicates(CELL_KEYS).iterrows():
-        own = done[cell["cell_id"]]
-        work = _work(own)
-        for kind, number, of, cost in _left_out(work, _work(done.get(cell["base_id"], own))):
-            if math.isnan(number) or not of > 0:
+        run = done[cell["cell_id"]]
+        work = _work(run)
+        for kind, number, whole, cost in _left_out(work, _work(done.get(cell["base_id"], run))):
+            if math.isnan(number) or not whole > 0:
                 continue
             unit = _kind(kind).unit
             total = work["seconds" if unit == "s" else "evaluations"]
             rows.append(
                 dict(cell[CELL_KEYS])
-                | {"kind": kind, "number": number, "share": number / of, "cost": cost}
+                | {"kind": kind, "number": number, "share": number / whole, "cost": cost}
                 | {"unit": unit, "cost_share": cost / total if total else math.nan}
             )
     columns = [*CELL_KEYS, "kind", "number", "share", "cost", "unit", "cost_share"]
@@ -195,7 +194,7 @@ def skipped(cells: pd.DataFrame, done: Mapping[str, DoneCell]) -> pd.DataFrame:
 def _left_out(
     work: Mapping[str, float], base: Mapping[str, float]
 ) -> Iterator[tuple[str, float, float, float]]:
-    """Yield the kinds of work: name, number left out, number in all, and cost."""
+    """Yield the kinds of work: name, skipped number, total number, and cost of the skipped."""
 
     def total(name: str) -> float:
         return work.get(name, math.nan)
@@ -229,13 +228,13 @@ def _left_out(
 
 
 def _above_zero(value: float) -> float:
-    """Return 0 for a number below it; NaN stays NaN."""
+    """Return a number, or 0 if it is negative; NaN stays NaN."""
     return 0.0 if value < 0 else value
 
 
-def _times(number: float, amount: float, of: float) -> float:
-    """Return what `number` takes at the mean of `amount` over `of`; NaN where `of` is 0 or NaN."""
-    return number * amount / of if of > 0 else math.nan
+def _times(number: float, amount: float, count: float) -> float:
+    """Return number * amount / count; NaN if `count` is 0 or NaN."""
+    return number * amount / count if count > 0 else math.nan
 
 
 def _kind(name: str) -> _Kind:
@@ -244,13 +243,13 @@ def _kind(name: str) -> _Kind:
 
 
 def skipped_table(
-    found: pd.DataFrame, labels: Sequence[str], condition: str, base: str
+    skipped_work: pd.DataFrame, labels: Sequence[str], condition: str, base: str
 ) -> TextTable:
-    """Return the table of `skipped` of one condition: means over a scene's runs, then over scenes.
+    """Return the table of `skipped` for one condition: means over a scene's runs, then over scenes.
 
-    It has no row for a kind of work that no run left out.
+    Kinds of work that no run skipped have no row.
     """
-    chosen = found[found["condition"] == condition]
+    chosen = skipped_work[skipped_work["condition"] == condition]
     by_scene = chosen.groupby(["kind", "label", "scene"], sort=False)[_NUMBERS].mean()
     means = by_scene.groupby(level=["kind", "label"], sort=False).mean()
     rows, notes = [], []
@@ -276,7 +275,7 @@ def skipped_table(
 
 
 def _texts(row: pd.Series) -> tuple[str, str]:
-    """Return the number that was left out and its cost as texts."""
+    """Return the skipped number and its cost as texts."""
     number = f"{_short(row['number'])} ({_share(row['share'])})"
     if math.isnan(row["cost"]):
         return number, _UNKNOWN
@@ -284,7 +283,7 @@ def _texts(row: pd.Series) -> tuple[str, str]:
 
 
 def _short(value: float) -> str:
-    """Write a number with the prefix of the SI for thousands, millions and so on."""
+    """Write a number with an SI prefix: 17,900 as `17.9 k`."""
     if not math.isfinite(value):
         return _UNKNOWN
     size = min(4, int(math.log10(value)) // 3) if value >= 1000 else 0

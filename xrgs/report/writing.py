@@ -1,4 +1,4 @@
-"""Writes numbers, changes and intervals as tables show them, and the notes that explain them."""
+"""Writes numbers, changes and intervals for tables, and the table that explains them."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ if TYPE_CHECKING:
     from xrgs.evaluation.metrics import Metric
     from xrgs.report.compare import Comparison
 
-#: An arrow means improvement or degradation, as in the paper's tables, not larger or smaller.
+#: Arrows mean improvement and degradation, as in the paper's tables: fewer Gaussians are `↑`.
 BETTER, WORSE, SAME = "↑", "↓", "="
-#: The text of a number whose cells all failed, or were not trained yet.
+#: The text in place of a number if no cell behind it is done.
 MISSING = "missing"
 #: The verdict of a change without an interval.
 NO_INTERVAL = "one replicate: no interval"
-#: What stands for a verdict beside a change.
+#: Verdict -> its mark after a change.
 _MARKS = {"better": " *", "worse": " *", "equivalent": " ≈"}
-#: Counts from this on are written in one of these units, as 17.9 G.
+#: Counts of at least this size are written with one of these prefixes, as 17.9 G.
 _LARGE, _PREFIXES = 1e7, ((1e12, "T"), (1e9, "G"), (1e6, "M"))
 
 
@@ -72,15 +72,15 @@ class Change(NamedTuple):
 def number(value: float, unit: str) -> str:
     """Write a value with its unit, at a precision that fits its size; NaN as n/a.
 
-    Bytes are written in MiB, and counts from ten million on with three digits in units of 10^6,
-    10^9 or 10^12: `17.9 G`.
+    Bytes are written in MiB; counts of ten million or more with three digits and an SI prefix:
+    `17.9 G`.
     """
     if math.isnan(value):
         return "n/a"
     if unit == "bytes":
         return f"{value / 2**20:,.1f} MiB"
     if not unit and _LARGE <= abs(value) < math.inf:
-        scale, prefix = next(of for of in _PREFIXES if abs(value) >= 0.9995 * of[0])
+        scale, prefix = next(p for p in _PREFIXES if abs(value) >= 0.9995 * p[0])
         return f"{value / scale:#.3g} {prefix}".replace(". ", " ")
     if math.isinf(value) or abs(value) >= (10 if unit == "s" else 1000):
         text = f"{value:,.0f}"
@@ -100,10 +100,10 @@ def signed(value: float) -> str:
 
 
 def arrow(change: float, metric: Metric) -> str:
-    """Return whether a change is an improvement, in the metric's own direction.
+    """Return the arrow of a change: whether it is an improvement of the metric.
 
     Returns:
-        `BETTER`, `WORSE`, `SAME` where the change is printed as 0.00, or a space for NaN.
+        `BETTER`, `WORSE`, `SAME` if the change is printed as 0.00, or a space for NaN.
     """
     if math.isnan(change):
         return " "
@@ -128,18 +128,18 @@ def pointed(change: float, metric: Metric) -> str:
 
 
 def with_unit(change: float, metric: Metric) -> str:
-    """Write a change with its unit and arrow, beside values of another unit: `-44.57 % ↑`."""
+    """Write a change with its unit and arrow: `-44.57 % ↑`."""
     unit = "" if math.isnan(change) else f" {change_unit(metric)}"
     return f"{signed(change)}{unit} {arrow(change, metric)}"
 
 
 def verdict(row: Change, metric: Metric) -> str:
-    """Say in words what the tests of a change show.
+    """Return the verdict of a change's tests, in words.
 
     Returns:
-        `equivalent` where the change is within its margin (TOST), else `better` or `worse` where
-        the corrected p is at most 0.05, else `not shown`; `descriptive` for a metric that is no
-        outcome; `one replicate: no interval`, or `n/a` with the reason.
+        `equivalent` if the change is within its margin (TOST), else `better` or `worse` if the
+        corrected p is at most 0.05, else `not shown`. `descriptive` for a metric that is no
+        outcome, `one replicate: no interval`, or `n/a` with the reason.
     """
     if math.isnan(row.change):
         return f"n/a: {row.why}"
@@ -158,13 +158,13 @@ def marked(row: Change | None, metric: Metric, scenes: int) -> str:
     """Write a mean change with its marks: `-44.57 ↑ * (3 of 4)`.
 
     Args:
-        row: The change; None where no pair of cells is done.
+        row: The change; None if no pair of cells is done.
         metric: The metric that changed.
-        scenes: How many scenes the mean should be over.
+        scenes: Number of scenes that the mean should include.
 
     Returns:
-        The change, a star where it is shown to be better or worse, `≈` where it is equivalent, and
-        the number of scenes behind the mean where some are lacking.
+        The change, `*` if it is shown to be better or worse, `≈` if it is equivalent, and the
+        number of scenes in the mean if some are lacking.
     """
     if row is None:
         return MISSING
@@ -173,7 +173,7 @@ def marked(row: Change | None, metric: Metric, scenes: int) -> str:
 
 
 def lacking(row: Change, scenes: int) -> str:
-    """Write how many scenes a mean is over, ` (3 of 4)`; empty where it is over all or none."""
+    """Write how many scenes a mean includes, ` (3 of 4)`; empty if all or none."""
     return f" ({row.scenes} of {scenes})" if 0 < row.scenes < scenes else ""
 
 
@@ -185,7 +185,7 @@ def p_value(p: float) -> str:
 
 
 def interval(low: float, high: float) -> str:
-    """Write an interval, `-1.20 to +3.40`; empty where there is none."""
+    """Write an interval, `-1.20 to +3.40`; empty for NaN."""
     return "" if math.isnan(low) else f"{signed(low)} to {signed(high)}"
 
 
@@ -199,15 +199,15 @@ def same_sign(row: Change) -> str:
 
 
 def legend(comparison: Comparison, tables: Sequence[TextTable]) -> TextTable:
-    """Return the table that says what the columns and marks of tables of changes mean.
+    """Return the table that explains the columns and marks of tables of changes.
 
     Args:
-        comparison: The comparison that the tables are of.
-        tables: The tables: a column or mark that none of them has is left out.
+        comparison: The comparison of the tables.
+        tables: The tables; only columns and marks that occur in them are explained.
     """
     design, base = comparison.design, comparison.base
     outcomes = ", ".join(m.label for m in comparison.metrics if m.name in design.outcomes)
-    # Each term with what it stands as: the head of a column, or what a cell's text matches.
+    # Term, the head of its column, the pattern of its mark in a cell's text, meaning.
     rows = (
         ("change", "", rf" [{BETTER}{WORSE}{SAME}]",
          f"mean over scenes of the means over replicates: the difference from {base} in dB, or the"
@@ -239,16 +239,16 @@ def legend(comparison: Comparison, tables: Sequence[TextTable]) -> TextTable:
     )  # fmt: skip
     heads = {head for table in tables for head in table.columns}
     texts = {text for table in tables for row in table.rows for text in row}
-    found = tuple(
+    shown = tuple(
         (term, meaning)
         for term, head, mark, meaning in rows
         if head in heads or (mark and any(re.search(mark, text) for text in texts))
     )
-    return TextTable("How to read the tables", ("", "meaning"), found, "ll", prose=True)
+    return TextTable("How to read the tables", ("", "meaning"), shown, "ll", prose=True)
 
 
 def by_key(table: pd.DataFrame) -> dict[tuple[str, ...], Change]:
-    """Return the rows of one of a `Comparison`'s tables of means, by their keys."""
+    """Convert one of a `Comparison`'s tables of means: index of a row -> the row."""
     columns = [name for name in Change._fields if name in table]
     rows = table[columns].itertuples(index=False)
     return {

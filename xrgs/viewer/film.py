@@ -1,7 +1,7 @@
 """Renders models along a path of cameras, side by side, into an MP4 film or PNG frames.
 
-The renderer and its settings are those of evaluation: a frame at a test camera with the intrinsics
-of the first test view is the render that was scored.
+Evaluation has the same renderer and settings: a frame at a test camera, if it has the intrinsics of
+the first test view, equals the scored render.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ _SIDES, _MAX_FRAMES = (16, 8192), 100_000
 #: The colours of a film by ITU-T H.273: primaries and matrix of BT.709, curve of sRGB, limited
 #: range. Players would take BT.601's matrix for small films and BT.709's for large ones.
 _PRIMARIES, _CURVE, _MATRIX, _LIMITED = 1, 13, 1, 1
-#: x264's constant rate factor: 18 is taken to be visually lossless.
+#: x264's constant rate factor; 18 counts as visually lossless.
 _CRF = "18"
-#: The share of a panel's height that a label takes, and its smallest size, px.
+#: The height of a label, as a share of the panel's, and its least height, px.
 _LABEL_SHARE, _MIN_LABEL = 0.04, 12
 
 
@@ -58,16 +58,16 @@ def make_film(
 
     Args:
         models: One model, or several of one world, which are shown side by side with their names.
-        out: An .mp4 file, which is replaced, or a folder that is new or empty, for one PNG a frame.
-        path: A name in `xrgs.viewer.paths.PATHS`; None for `orbit`, or for `training` where an
-            orbit would leave the space that the training cameras see.
+        out: An .mp4 file, which is replaced, or a new or empty folder for PNGs, one for each frame.
+        path: A name in `xrgs.viewer.paths.PATHS`; None for `orbit`, or for `training` if an orbit
+            would leave the space that the training cameras see.
         views: Number of frames. All have the intrinsics of the first test view.
         size: Width and height of one model's panel, px, both even; None for the size of the first
-            test view, without its last row or column where that is odd.
-        fps: Frames a second of a film.
+            test view, cut to even numbers.
+        fps: Frames per second of a film.
 
     Returns:
-        A line on the file and the frames.
+        A line for the terminal: the file, the number and size of the frames, the path.
 
     Raises:
         XrgsError: An argument is out of its range, no model has cameras, PyAV is missing, or `out`
@@ -108,7 +108,7 @@ def _check(path: str | None, views: int, fps: int, size: tuple[int, int] | None)
 
 
 def _is_film(out: Path) -> bool:
-    """Return whether `out` is a film, and not a folder of frames; check that films can be made."""
+    """Return whether `out` is a film and not a folder; check that PyAV is there for a film."""
     if out.suffix.lower() != _MP4:
         if out.suffix:
             raise XrgsError(f"out={out}: must end with {_MP4}, or be a folder, without a suffix")
@@ -124,18 +124,18 @@ def _is_film(out: Path) -> bool:
 
 
 def _panel_camera(view: Camera, size: tuple[int, int] | None) -> Camera:
-    """Return the intrinsics of a panel, which shows as much from left to right as a view does."""
+    """Return the camera of a panel, which has the view's horizontal field of view."""
     width, height = size or (view.width - view.width % 2, view.height - view.height % 2)
     scale = width / view.width if size else 1.0
     K = view.K.clone()
     K[:2] *= scale
-    if size:  # the rows that are added or left out are so at the top and at the bottom alike
+    if size:  # rows are added or cut equally at the top and the bottom
         K[1, 2] += (height - scale * view.height) / 2
     return Camera(view.viewmat, K, width, height)
 
 
 def _frames(models: Sequence[Model], cameras: Sequence[Camera]) -> Iterator[Frame]:
-    """Yield one frame a camera: the renders of all models from left to right."""
+    """Yield a frame for each camera: the renders of all models from left to right."""
     for camera in progress(cameras, "rendering", "frame"):
         panels = [_panel(model, camera) for model in models]
         if len(models) > 1:
@@ -152,7 +152,7 @@ def _panel(model: Model, camera: Camera) -> Frame:
 
 
 def _labelled(panel: Frame, name: str) -> Frame:
-    """Write a name into the upper left corner, white on a dark box."""
+    """Write a name into the upper left corner of a panel, white on a dark box."""
     image = Image.fromarray(panel)
     draw = ImageDraw.Draw(image)
     height = max(_MIN_LABEL, round(_LABEL_SHARE * image.height))
@@ -165,13 +165,13 @@ def _labelled(panel: Frame, name: str) -> Frame:
 
 
 def _write_film(frames: Iterable[Frame], out: Path, fps: int) -> None:
-    """Encode frames as H.264 in an MP4 file, which appears when it is complete."""
+    """Encode frames as H.264 in an MP4 file, which appears only when complete."""
     import av
 
     out.parent.mkdir(parents=True, exist_ok=True)
     with atomic_writer(out) as stream, av.open(stream, "w", format="mp4") as container:
         video: Any = container.add_stream("libx264", rate=fps, options={"crf": _CRF})
-        video.pix_fmt = "yuv420p"  # what browsers and players show
+        video.pix_fmt = "yuv420p"  # browsers and players need it
         coder = video.codec_context
         coder.color_primaries, coder.color_trc = _PRIMARIES, _CURVE
         coder.colorspace, coder.color_range = _MATRIX, _LIMITED
@@ -186,7 +186,7 @@ def _write_film(frames: Iterable[Frame], out: Path, fps: int) -> None:
 
 
 def _write_pngs(frames: Iterable[Frame], out: Path, _: int) -> None:
-    """Write `0000.png` and so on into a folder that is new or empty."""
+    """Write `0000.png`, `0001.png` and so on into a new or empty folder."""
     folder = out
     folder.mkdir(parents=True, exist_ok=True)
     if list_names(folder):

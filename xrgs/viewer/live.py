@@ -1,8 +1,8 @@
-"""Shows models live in a browser: viser draws the splats, one frame a model under one camera.
+"""Shows models live in a browser: viser draws the splats of each model in a frame of one page.
 
-Each model has a server of its own, since a page of viser shows one scene. One page holds the frames
-of all of them, and the camera that a user moves moves the others. All servers listen on this
-machine's loopback interface alone.
+Each model has its own viser server, since a page of viser shows one scene. If the user moves the
+camera of a frame, those of the other frames follow. All servers listen only on the loopback
+interface.
 """
 
 from __future__ import annotations
@@ -33,22 +33,22 @@ if TYPE_CHECKING:
     from xrgs.splat.cameras import Camera
     from xrgs.viewer.models import Model
 
-    _Place = dict[str, Any]  # by the names of _PLACE
+    _Pose = dict[str, Any]  # by the names of _POSE
 
 HOST = "127.0.0.1"
 NOT_ANTIALIASED = (
     "it is antialiased, which viser can't draw: small and far Gaussians look thicker here than "
     "in xrgs-render and in the report"
 )
-"""What is said of an antialiased model."""
-#: So many places that a camera was told to take are remembered until it reports them.
+"""The note on an antialiased model."""
+#: How many poses that we set ourselves are remembered, to tell them from the user's moves.
 _REMEMBERED = 1000
-#: A browser reports a place this near to the one that it was told, as a share of the distance
-#: from the camera to the point that it looks at.
+#: A browser rounds a pose that we set by up to this much, relative to the distance from the camera
+#: to the point that it looks at.
 _ROUNDING = 1e-4
-#: The attributes of viser's cameras that make up a place.
-_PLACE = ("position", "look_at", "up_direction", "fov")
-#: The size of a drawn camera, as a share of the cameras' median distance from what they look at.
+#: The attributes of viser's cameras that make up a pose.
+_POSE = ("position", "look_at", "up_direction", "fov")
+#: The size of a drawn camera, relative to the cameras' median distance from their focus.
 _FRUSTUM_SCALE = 0.04
 _PAGE = """<!doctype html>
 <html lang="en"><meta charset="utf-8"><title>xrgs-view</title>
@@ -69,12 +69,12 @@ _POLICY = f"default-src 'none'; style-src 'unsafe-inline'; frame-src http://{HOS
 
 @contextmanager
 def shown(models: Sequence[Model], port: int, limit: int) -> Iterator[str]:
-    """Show models for the length of a block.
+    """Show models while a `with` block runs.
 
     Args:
         models: One model, or several of one world.
-        port: The port of the page; viser's servers take the next ones that are free. 0 lets the
-            system choose all of them.
+        port: The port of the page; viser's servers take the next free ones. 0 lets the system
+            choose all of them.
         limit: The most Gaussians of a model that are drawn, see `xrgs.viewer.splats.to_splats`.
 
     Yields:
@@ -95,7 +95,7 @@ def shown(models: Sequence[Model], port: int, limit: int) -> Iterator[str]:
                 server = viser.ViserServer(HOST, wanted, verbose=False)
             stack.callback(_stop, server)
             _fill(server, model, reference(models), limit)
-            if start is not None:  # to which viser's own button leads back
+            if start is not None:  # for viser's button that resets the camera
                 home = server.initial_camera
                 home.position, home.look_at = start["position"], start["look_at"]
                 home.up, home.fov = start["up_direction"], start["fov"]
@@ -116,7 +116,7 @@ def _stop(server: ViserServer) -> None:
 
 @contextmanager
 def _without_banners() -> Iterator[None]:
-    """Hide what viser prints: the addresses of single frames, which nobody should open."""
+    """Hide viser's output: it prints the addresses of single frames, which nobody should open."""
     with redirect_stdout(io.StringIO()):
         yield
 
@@ -147,12 +147,12 @@ class _PageHandler(BaseHTTPRequestHandler):
     server: _PageServer
 
     def do_GET(self) -> None:
-        found = self.path == "/"
-        self.send_response(200 if found else 404)
+        is_page = self.path == "/"
+        self.send_response(200 if is_page else 404)
         self.send_header("Content-Type", "text/html; charset=utf-8")
         self.send_header("Content-Security-Policy", _POLICY)
         self.end_headers()
-        if found:
+        if is_page:
             self.wfile.write(self.server.content)
 
     def log_message(self, *_: object) -> None:
@@ -160,7 +160,7 @@ class _PageHandler(BaseHTTPRequestHandler):
 
 
 def _fill(server: ViserServer, model: Model, world: Model | None, limit: int) -> None:
-    """Add the splats of a model, and the cameras of the world that it is in."""
+    """Add the splats of a model, and the cameras of its world."""
     splats = to_splats(model.gaussians, limit)
     server.gui.configure_theme(control_width="small", show_share_button=False, show_logo=False)
     # viser keeps covariances as float16, where standard deviations below 0.0002 become 0 and those
@@ -180,7 +180,7 @@ def _fill(server: ViserServer, model: Model, world: Model | None, limit: int) ->
 
 
 def count_text(model: Model, limit: int) -> str:
-    """Say how many Gaussians of a model are drawn, at most `limit`."""
+    """Return a phrase on how many Gaussians of a model are drawn, at most `limit`."""
     count = len(model.gaussians)
     if count <= limit:
         return f"{count:,} Gaussians"
@@ -213,8 +213,8 @@ def _add_cameras(server: ViserServer, world: Model) -> None:
     server.scene.set_up_direction(tuple(up_direction(world.poses)))
 
 
-def _start(world: Model | None) -> _Place | None:
-    """Return the place of the first test view, which looks at what all cameras look at."""
+def _start(world: Model | None) -> _Pose | None:
+    """Return the first test view's pose, turned to the point that the training cameras look at."""
     if world is None or world.poses is None:
         return None
     first = next(view.camera for view in world.views if view.kind == "test")
@@ -227,12 +227,12 @@ def _start(world: Model | None) -> _Place | None:
 
 
 def _vertical_fov(camera: Camera) -> float:
-    """Return the angle from the upper to the lower edge of a camera's image, radians."""
+    """Return the vertical field of view of a camera, radians."""
     return 2 * math.atan2(camera.height / 2, float(camera.K[1, 1]))
 
 
 def _go_to(event: Any) -> None:
-    """Move the camera of the browser to the camera that was clicked."""
+    """Move the browser's camera to the clicked camera."""
     camera, clicked = event.client.camera, event.target
     camera.position, camera.wxyz = clicked.position, clicked.wxyz
 
@@ -240,60 +240,59 @@ def _go_to(event: Any) -> None:
 class _SharedCamera:
     """Lets the cameras of all frames follow the one that the user moves.
 
-    A camera that follows reports its new place just as one that the user moves does. So a report
-    of a place that the camera was told to take is no move of the user, however late it comes. A
-    frame that opens reports places of the browser's own choice first. So it is told its place
-    again until it has reported one that it was told.
+    A camera reports each new pose, whether the user moved it or we set it. So a reported pose that
+    we have set is no move of the user, however late it comes. A frame that opens first reports
+    poses of the browser's choice, so we set its pose again until it reports one that we have set.
     """
 
-    def __init__(self, start: _Place | None) -> None:
+    def __init__(self, start: _Pose | None) -> None:
         self._lock = threading.Lock()
-        self._place = start
-        self._told: dict[ClientHandle, deque[_Place]] = {}
+        self._pose = start
+        self._set_poses: dict[ClientHandle, deque[_Pose]] = {}
         self._arrived: set[ClientHandle] = set()
 
     def join(self, client: ClientHandle) -> None:
-        """Let a frame's camera follow and lead."""
+        """Add a frame, whose camera then follows the others and can lead them."""
         with self._lock:
-            self._told[client] = deque(maxlen=_REMEMBERED)
-            if self._place is not None:
-                self._tell(client, self._place)
+            self._set_poses[client] = deque(maxlen=_REMEMBERED)
+            if self._pose is not None:
+                self._set(client, self._pose)
         client.camera.on_update(self._moved)
 
     def leave(self, client: ClientHandle) -> None:
         """Forget a frame that was closed."""
         with self._lock:
-            self._told.pop(client, None)
+            self._set_poses.pop(client, None)
             self._arrived.discard(client)
 
     async def _moved(self, camera: CameraHandle) -> None:
-        place, client = {name: getattr(camera, name) for name in _PLACE}, camera.client
+        pose, client = {name: getattr(camera, name) for name in _POSE}, camera.client
         with self._lock:
-            told = self._told.get(client)
-            if told is None:  # it has left
+            poses = self._set_poses.get(client)
+            if poses is None:  # the frame was closed
                 return
-            if any(_same(place, known) for known in told):  # it follows
+            if any(_same(pose, other) for other in poses):  # a pose that we have set
                 self._arrived.add(client)
-                while not _same(place, told[0]):
-                    told.popleft()
-            elif self._place is None or client in self._arrived:  # the user moved it
+                while not _same(pose, poses[0]):
+                    poses.popleft()
+            elif self._pose is None or client in self._arrived:  # the user moved it
                 self._arrived.add(client)
-                self._place = place
-                told.clear()
-                for other in self._told:
+                self._pose = pose
+                poses.clear()
+                for other in self._set_poses:
                     if other is not client:
-                        self._tell(other, place)
+                        self._set(other, pose)
             else:
-                self._tell(client, self._place)
+                self._set(client, self._pose)
 
-    def _tell(self, client: ClientHandle, place: _Place) -> None:
-        self._told[client].append(place)
+    def _set(self, client: ClientHandle, pose: _Pose) -> None:
+        self._set_poses[client].append(pose)
         with client.atomic():
-            for name in _PLACE:
-                setattr(client.camera, name, place[name])
+            for name in _POSE:
+                setattr(client.camera, name, pose[name])
 
 
-def _same(first: _Place, second: _Place) -> bool:
-    """Return whether two places differ by no more than a browser's rounding."""
+def _same(first: _Pose, second: _Pose) -> bool:
+    """Return whether two poses differ at most by the browser's rounding."""
     near = _ROUNDING * np.linalg.norm(np.subtract(first["position"], first["look_at"]))
-    return all(np.allclose(first[name], second[name], rtol=0, atol=near) for name in _PLACE)
+    return all(np.allclose(first[name], second[name], rtol=0, atol=near) for name in _POSE)

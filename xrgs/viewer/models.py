@@ -1,4 +1,4 @@
-"""Loads models to look at: the Gaussians of a cell with its cameras, or of a file."""
+"""Loads models for viewing: the Gaussians of a cell with its cameras, or of a file."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-#: The most models that are shown beside each other.
+#: The most models shown side by side.
 MAX_MODELS = 2
 #: The longest name of a model, in characters.
 _MAX_NAME = 60
@@ -37,26 +37,26 @@ class PosedView:
 
     name: str
     kind: str
-    """`HR` or `LR` of a training view, `test` of one that is scored."""
+    """`HR` or `LR` for a training view, `test` for a scored view."""
     camera: Camera
 
 
 @dataclass(frozen=True)
 class Model:
-    """Gaussians to look at, with their cameras where these are known."""
+    """Gaussians for viewing, with their cameras if these are known."""
 
     name: str
-    """The name that people see: one printable line."""
+    """The shown name, one printable line."""
     gaussians: Gaussians
     settings: RasterSettings
-    """How its Gaussians become pixels: as in its training. For a file, the defaults, antialiased
-    where the file says so."""
+    """The settings of rendering, as in training. For a file, the defaults, antialiased if the file
+    says so."""
     views: tuple[PosedView, ...] = ()
-    """Its views, training views first; none for a file."""
+    """The views, training views first; none for a file."""
     poses: Poses | None = None
     """The cameras of the views as arrays, for paths; None for a file."""
     variant: str = ""
-    """The id of its variant, which decides its world; empty for a file."""
+    """The id of the variant: models of one variant share a world. Empty for a file."""
 
 
 def load_models(words: Sequence[str], store: Store, antialiased: bool | None = None) -> list[Model]:
@@ -66,15 +66,15 @@ def load_models(words: Sequence[str], store: Store, antialiased: bool | None = N
         words: The cells, each as `Store.find_cell` takes it, or as the path of a .ply, .glb or
             .spz file.
         store: The store that has the cells.
-        antialiased: Whether to render antialiased; None renders each as it was trained. Where a
-            model says otherwise, a warning names it.
+        antialiased: Whether to render antialiased; None renders each as it was trained. A warning
+            names a model that was trained otherwise.
 
     Returns:
         The models, in the order of the words.
 
     Raises:
-        XrgsError: There are none or too many words, a word names no finished cell, a file is
-            damaged, or the cells are of different variants; the message names the word or the file.
+        XrgsError: There are no words or too many, a word names no finished cell, a file is damaged,
+            or the cells are of different variants; the message names the word or the file.
     """
     if not 1 <= len(words) <= MAX_MODELS:
         raise XrgsError(f"give one cell or {MAX_MODELS}, each by its id or as a file")
@@ -89,7 +89,7 @@ def load_models(words: Sequence[str], store: Store, antialiased: bool | None = N
 
 
 def reference(models: Sequence[Model]) -> Model | None:
-    """Return the first model that has views; None where all are files."""
+    """Return the first model that has views; None if all are files."""
     return next((model for model in models if model.views), None)
 
 
@@ -109,12 +109,12 @@ def find_cell(word: str, store: Store) -> CellFolder:
 def _with(model: Model, antialiased: bool | None) -> Model:
     if antialiased is None or antialiased == model.settings.antialiased:
         return model
-    own = "antialiased" if model.settings.antialiased else "not antialiased"
+    trained = "antialiased" if model.settings.antialiased else "not antialiased"
     if not model.views and not model.settings.antialiased:
-        own = "without a word about antialiasing"
+        trained = "without a word about antialiasing"
     _log.warning(
         "%s is %s; it is rendered %s, as asked",
-        *(model.name, own, "antialiased" if antialiased else "without antialiasing"),
+        *(model.name, trained, "antialiased" if antialiased else "without antialiasing"),
     )
     return replace(model, settings=replace(model.settings, antialiased=antialiased))
 
@@ -135,7 +135,7 @@ def _load(word: str, store: Store) -> Model:
     train = [PosedView(view.name, view.tag, view.camera) for view in data.train]
     test = [PosedView(view.name, "test", view.camera) for view in data.test]
     viewmats = [
-        np.stack([view.camera.viewmat.double().numpy() for view in of]) for of in (train, test)
+        np.stack([view.camera.viewmat.double().numpy() for view in part]) for part in (train, test)
     ]
     poses = Poses(viewmats[0], viewmats[1], data.points.double().numpy())
     names = store.cell_names().get(cell.id)

@@ -1,4 +1,4 @@
-"""Paths of cameras through a scene, fitted to the cameras that it was photographed from.
+"""Paths of cameras through a scene, fitted to the cameras of its photographs.
 
 All computations are in float64, in the normalised world of `xrgs.splat.normalize`. Its unit is the
 median distance of the cameras from the point that they look at. Cameras have OpenCV axes.
@@ -22,29 +22,29 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-#: How much the depth of the points counts for the focus, beside the distances from the optical
-#: axes: at axes that are 6 degrees apart both weigh the same. Our choice.
+#: The weight of the points' depth in `look_at_point`, relative to the distances from the optical
+#: axes: for axes 6 degrees apart both count the same. Our choice.
 _DEPTH_WEIGHT = 0.01
-#: Cameras that leave no gap as wide as this around the focus, in degrees, surround it. Our choice.
+#: Cameras surround the focus if no gap between them is as wide as this, degrees. Our choice.
 _LARGEST_GAP = 90.0
-#: The length of the mean of the viewing directions, 0 to 1, from which cameras face one way.
+#: Cameras face one way if the mean of their viewing directions is at least this long, 0 to 1.
 _MIN_FACING = 0.5
-#: LLFF's spiral: percentile of the cameras' offsets that is its radius, percentiles of the points'
-#: depths that are its bounds with their factors, weight of the near one, turns, and how many turns
-#: along the optical axis there are for each around it.
+#: LLFF's spiral: the percentile of the cameras' offsets that is its radius; the percentiles of the
+#: points' depths that are the near and far bound, factors of the two, weight of the near one; the
+#: number of turns, and of oscillations along the optical axis for each turn.
 _RADIUS_PERCENTILE, _DEPTH_PERCENTILES = 90.0, (0.1, 99.9)
 _NEAR_FACTOR, _FAR_FACTOR, _NEAR_WEIGHT = 0.9, 5.0, 0.25
 _TURNS, _AXIAL_RATE = 2, 0.5
-#: Frames between two cameras of the path along the training cameras. Our choice.
+#: Frames between two cameras of the path `training`. Our choice.
 _FRAMES_BETWEEN = 10
-#: Cameras of an orbit that are judged, and the angle to which a training camera looks the same way,
-#: degrees. Our choice.
+#: How many cameras of an orbit `default_path` tests, and the angle up to which a training camera
+#: looks the same way as one of them, degrees. Our choice.
 _PROBES, _SAME_WAY = 36, 60.0
 
 
 @dataclass(frozen=True)
 class Poses:
-    """The cameras that a path is fitted to, and the points that they see."""
+    """The cameras to which a path is fitted, and the SfM points."""
 
     train: Array
     """[C, 4, 4] world to camera, of the training views; at least one."""
@@ -57,13 +57,13 @@ class Poses:
 def orbit(poses: Poses, views: int) -> Array:
     """Move on a circle around the point that the training cameras look at, and look at it.
 
-    The circle is level, at the median height and the median distance of the cameras. Where they
-    surround the point, the circle is closed. Where they leave a gap of more than 90 degrees, as in
-    a forward-facing scene, the path swings to and fro over the arc that they span: nobody has
-    photographed the scene from elsewhere.
+    The circle is level, at the median height and the median distance of the cameras. If they
+    surround the point, the circle is closed. If they leave a gap of more than 90 degrees, as in a
+    forward-facing scene, the path swings to and fro over their arc, since the scene was not
+    photographed from elsewhere.
 
     Args:
-        poses: What the path is fitted to.
+        poses: The cameras and points of the scene.
         views: Number of cameras, at least 1.
 
     Returns:
@@ -95,7 +95,7 @@ def spiral(poses: Poses, views: int) -> Array:
     farthest depth of the points, with weights 1/4 and 3/4.
 
     Args:
-        poses: What the path is fitted to.
+        poses: The cameras and points of the scene.
         views: Number of cameras, at least 1.
 
     Returns:
@@ -118,7 +118,7 @@ def spiral(poses: Poses, views: int) -> Array:
     depth = 1 / (_NEAR_WEIGHT / (_NEAR_FACTOR * near) + (1 - _NEAR_WEIGHT) / (_FAR_FACTOR * far))
     target = centre + depth * rotation[2]
     angles = 2 * np.pi * _TURNS * np.arange(views) / views
-    # The minus signs of LLFF are of its axes up and backward; these are down and forward.
+    # LLFF has minus signs here: its axes point up and backward, ours down and forward.
     turns = np.stack([np.cos(angles), np.sin(angles), np.sin(_AXIAL_RATE * angles)], axis=1)
     places = centre + (turns * radii) @ rotation
     return np.stack([_look_at(place, target - place, up) for place in places])
@@ -131,7 +131,7 @@ def through_test_views(poses: Poses, views: int) -> Array:
     at constant angular velocity. The first camera is the first test view, the last one the last.
 
     Args:
-        poses: What the path is fitted to.
+        poses: The cameras and points of the scene.
         views: Number of cameras, at least 1.
 
     Returns:
@@ -143,11 +143,11 @@ def through_test_views(poses: Poses, views: int) -> Array:
 def through_training_views(poses: Poses, views: int) -> Array:
     """Move along the training cameras in their order, from the first to the last.
 
-    The path goes through one camera for ten frames, evenly chosen, and between two as
-    `through_test_views` does: through every one of many it would shake.
+    It passes through evenly chosen cameras, one for every ten frames: through all of many cameras
+    it would shake. In between it is interpolated as in `through_test_views`.
 
     Args:
-        poses: What the path is fitted to.
+        poses: The cameras and points of the scene.
         views: Number of cameras, at least 1.
 
     Returns:
@@ -170,15 +170,15 @@ def _through(viewmats: Array, views: int) -> Array:
 
 
 def default_path(poses: Poses) -> str:
-    """Return `orbit`, or `training` where an orbit would leave the space that the cameras see.
+    """Return `orbit`, or `training` if an orbit would leave the space that the cameras see.
 
-    It stays there if each of its cameras has a training camera that is nearer than the point that
-    they look at, and looks the same way to 60 degrees. Around an object, and in the arc before a
-    forward-facing scene, that holds. In a scene that is seen from inside, the cameras look outwards
-    and an orbit inwards.
+    An orbit stays in that space if each of its cameras has a training camera that is nearer to it
+    than the focus is, and looks the same way to 60 degrees. That holds around an object, and on the
+    arc in front of a forward-facing scene. In a scene seen from inside, the training cameras look
+    outwards and an orbit looks inwards.
 
     Args:
-        poses: What the path is fitted to.
+        poses: The cameras and points of the scene.
     """
     path = orbit(poses, _PROBES)
     places, focus = camera_positions(path), look_at_point(poses)
@@ -194,15 +194,15 @@ PATHS: dict[str, Callable[[Poses, int], Array]] = {
     "spiral": spiral,
     "test": through_test_views,
 }
-"""The kinds of paths by name."""
+"""Name of a path -> the function that computes it."""
 
 
 def look_at_point(poses: Poses) -> Array:
     """Return the point that the training cameras look at.
 
     It is the point [3] of least squared distance from the optical axes, and, with a small weight,
-    from the points on the axes at the median depth of the SfM points. That weight decides where the
-    axes are nearly parallel, and leave the depth open.
+    from the points on the axes at the median depth of the SfM points. The second part matters if
+    the axes are nearly parallel, and so don't fix the depth.
     """
     positions, forward = camera_positions(poses.train), poses.train[:, 2, :3]
     targets = positions + np.median(_depths(poses)) * forward  # [C, 3]
@@ -214,7 +214,7 @@ def look_at_point(poses: Poses) -> Array:
 
 
 def up_direction(poses: Poses) -> Array:
-    """Return the unit vector [3] that is up in the images of the training cameras, in the mean."""
+    """Return the mean up direction of the training cameras' images, a unit vector [3]."""
     return _up(poses.train)
 
 
@@ -224,7 +224,7 @@ def _up(viewmats: Array) -> Array:
 
 
 def _depths(poses: Poses) -> Array:
-    """Return the depths above 0 of the points in all training cameras; 1 without any."""
+    """Return the positive depths of the points in all training cameras, [N]; [1] if none is."""
     viewmats = poses.train
     depths = (poses.points @ viewmats[:, 2, :3].T + viewmats[:, 2, 3]).ravel()  # [P C]
     in_front: Array = depths[depths > 0]
@@ -238,7 +238,7 @@ def _perpendicular(axis: Array) -> Array:
 
 
 def _widest_arc(angles: Array) -> tuple[float, float]:
-    """Return the start and the length, radians, of the arc that is left by the largest gap."""
+    """Return start and length, radians, of the arc outside the largest gap between angles."""
     ordered = np.sort(angles % (2 * np.pi))
     gaps = np.diff(ordered, append=ordered[0] + 2 * np.pi)
     largest = int(gaps.argmax())
@@ -247,7 +247,7 @@ def _widest_arc(angles: Array) -> tuple[float, float]:
 
 
 def _look_at(position: Array, forward: Array, up: Array) -> Array:
-    """Return the viewmat [4, 4] of a camera that stands at a position and looks forward."""
+    """Return the viewmat [4, 4] of a camera from its position and viewing direction."""
     right = np.cross(forward, up)
     axes = np.stack([right, np.cross(forward, right), forward])
     rotation = axes / np.linalg.norm(axes, axis=1, keepdims=True)
@@ -256,7 +256,7 @@ def _look_at(position: Array, forward: Array, up: Array) -> Array:
 
 
 def _viewmats(rotations: Array, positions: Array) -> Array:
-    """Return viewmats [n, 4, 4] of rotations from the world [n, 3, 3] and positions [n, 3]."""
+    """Return viewmats [n, 4, 4] from world-to-camera rotations [n, 3, 3] and positions [n, 3]."""
     viewmats = np.repeat(np.eye(4)[None], len(rotations), axis=0)
     viewmats[:, :3, :3] = rotations
     viewmats[:, :3, 3] = -np.einsum("nij,nj->ni", rotations, positions)

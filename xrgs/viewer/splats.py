@@ -1,7 +1,7 @@
-"""Gaussians as the arrays that viewers in a browser draw: positions, covariances and flat colours.
+"""Converts Gaussians for viewers in a browser: to positions, covariances and flat colours.
 
-Such viewers sort and blend all Gaussians of a scene themselves. That is slow for more than some
-hundred thousand, so the least opaque ones can be left out.
+Such viewers sort and blend all Gaussians themselves, which is slow for more than some hundred
+thousand, so that the least opaque ones can be left out.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Splats:
 
 @torch.no_grad()
 def to_splats(gaussians: Gaussians, limit: int) -> Splats:
-    """Return the `limit` most opaque Gaussians of a model; of equal ones, the first."""
+    """Convert the `limit` most opaque Gaussians of a model; of equal ones, the first are taken."""
     kept = gaussians.opacities.argsort(descending=True, stable=True)[:limit].sort().values
     rotations, scales = rotation_matrices(gaussians.quats[kept]), gaussians.scales[kept].exp()
     factor = rotations * scales[:, None, :]  # [N, 3, 3], each axis times its length

@@ -1,8 +1,7 @@
-"""What the page of a report shows of trained models: renders of training views, and Gaussians.
+"""Renders training views and quantises Gaussians for the page of a report.
 
-Cells keep renders of the views that they are scored on alone, so training views are rendered here.
-Reports are made without torch, which renders: they call this module where a page shows pictures,
-and get plain numbers, bytes and arrays.
+Cells keep only renders of scored views, so training views are rendered here. Reports don't import
+torch: they call this module only for pages with pictures, and get plain numbers, bytes and arrays.
 """
 
 from __future__ import annotations
@@ -33,54 +32,54 @@ if TYPE_CHECKING:
 
     Image = NDArray[np.float32]  # [H, W, 3] 0..1
 
-#: How many training views of each tag are shown.
+#: The number of shown training views of each tag.
 SHOWN_OF_A_TAG = 2
 LOG_SCALES = (-9.0, 3.0)
-"""Natural logarithms of a model's scales that 8 bits cover, in the normalised world. A step is 5%,
-and smaller scales are far below a pixel."""
+"""The range of the scales' natural logarithms that 8 bits cover, in the normalised world. A step is
+5%, and smaller scales are far below a pixel."""
 GAUSSIAN_BYTES = 17
 """Bytes of a quantised Gaussian: 3 coordinates of 16 bits, and 8 bits for each of 3 scales, 4
 components of the quaternion, 3 colours and the opacity."""
-#: How many training views decide which Gaussians show; more are no longer worth the time.
+#: The number of training views by which the shown Gaussians are chosen; more cost too much time.
 _MAX_DECIDING = 12
 
 
 @dataclass(frozen=True)
 class TrainingView:
-    """A training view beside renders of it."""
+    """A training view with its renders by several cells."""
 
     name: str
     tag: str
     """`HR` or `LR`."""
     size: tuple[int, int]
-    """Width and height of the photograph that was trained on, px."""
+    """Width and height of the photograph in training, px."""
     photograph: Image
     original: Image | None
-    """The photograph before it was degraded; None where it was not."""
+    """The photograph before it was degraded; None if it was not."""
     rendered: tuple[int, int]
-    """Width and height of the renders, px: as of the original where there is one."""
+    """Width and height of the renders, px: the original's size, else the photograph's."""
     renders: dict[str, Image]
-    """The renders by the cell's id."""
+    """Id of a cell -> its render."""
 
 
 @dataclass(frozen=True)
 class PageModel:
-    """The Gaussians of a cell that show most in its training views, quantised."""
+    """The Gaussians of a cell with the largest blending weights in training views, quantised."""
 
     count: int
-    """How many they are, of the cell's `total`."""
+    """Number of kept Gaussians, of the cell's `total`."""
     total: int
     share: float
-    """The share of all blending weight in the training views that they have."""
+    """Their share of all blending weights in the training views, 0 to 1."""
     eps2d: float
     antialiased: bool
     content: bytes
-    """See `quantise`."""
+    """The bytes of `quantise`."""
     log_scales: tuple[float, float] = LOG_SCALES
 
 
 class TrainedScene:
-    """The cells of one variant: its cameras, renders of its training views, and their models."""
+    """Cells of one variant: its cameras, and the cells' renders and models."""
 
     def __init__(self, variant: Variant) -> None:
         """Load the photographs and cameras.
@@ -96,7 +95,7 @@ class TrainedScene:
         """Load the Gaussians of a cell.
 
         Raises:
-            XrgsError: They can't be read, or are not finite; the message says why.
+            XrgsError: The Gaussians can't be read, or are not finite; the message says why.
         """
         try:
             raster, gaussians = cell.config().splat.raster, cell.gaussians()
@@ -113,8 +112,8 @@ class TrainedScene:
         """Return the cameras of the training views, then of the test views, as plain numbers.
 
         Returns:
-            For each `name`; `kind` (`HR`, `LR` or `test`); `size` (width and height, px); `K` (fx,
-            fy, cx, cy, px); `viewmat` (the upper three rows, world to camera).
+            For each camera: `name`; `kind` (`HR`, `LR` or `test`); `size` (width and height, px);
+            `K` (fx, fy, cx, cy, px); `viewmat` (the upper three rows, world to camera).
         """
         data = self._data
         views = [(view.name, view.tag, view.camera) for view in data.train]
@@ -131,10 +130,10 @@ class TrainedScene:
         ]
 
     def training_views(self) -> Iterator[TrainingView]:
-        """Yield some views of each tag with renders by all cells.
+        """Yield some training views of each tag with the renders of all cells.
 
-        LR views come first, as in the paper's figures. They are rendered at the size that they had
-        before they were degraded.
+        LR views come first, as in the paper's figures. They are rendered at their size before
+        degradation.
         """
         for view in _evenly(self._data):
             original = self._originals.get(view.name) if view.tag == "LR" else None
@@ -160,7 +159,7 @@ class TrainedScene:
 
 @dataclass(frozen=True)
 class _Model:
-    """The Gaussians of a cell, and how they become pixels."""
+    """The Gaussians of a cell, and the settings of their rendering."""
 
     gaussians: Gaussians
     activated: ActivatedGaussians
@@ -169,7 +168,7 @@ class _Model:
 
     @torch.no_grad()
     def render(self, camera: Camera) -> Image:
-        """Render a view with all bands, as evaluation does."""
+        """Render a view with all bands of the harmonics, as evaluation does."""
         render = rasterize(self.gaussians, camera, settings=self.raster, backend=self.backend)
         return np.asarray(render.image.numpy())
 
@@ -178,10 +177,10 @@ class _Model:
         weights = torch.zeros_like(self.activated.opacities)
         for camera in cameras:
             ones = torch.ones(camera.height, camera.width)
-            found = attribute_pixels(
+            attribution = attribute_pixels(
                 ones, self.activated, camera, self.raster, backend=self.backend
             )
-            weights += found.sums
+            weights += attribution.sums
         # Stable, so that equal weights keep the order of the file.
         order = torch.sort(weights, descending=True, stable=True).indices[:most]
         kept, _ = order.sort()
@@ -197,18 +196,18 @@ class _Model:
 
 
 def quantise(gaussians: ActivatedGaussians, kept: torch.Tensor) -> bytes:
-    """Quantise Gaussians for the page's viewer, which undoes it in `splats.js`.
+    """Quantise Gaussians for the page's viewer; `splats.js` undoes it.
 
-    A coordinate x is kept as x / (1 + |x|): the centre of the normalised world has a resolution of
-    3e-5, and Gaussians far away still have a place. Of the harmonics band 0 is kept.
+    A coordinate x is stored as x / (1 + |x|): the resolution is 3e-5 at the centre of the
+    normalised world, and any distance fits. Only band 0 of the harmonics is kept.
 
     Args:
         gaussians: N Gaussians.
-        kept: [M] which of them to take.
+        kept: [M] indices of those to keep.
 
     Returns:
-        M times three little-endian uint16 of the means; then M times 11 uint8: three scales (their
-        logarithms over `LOG_SCALES`), the quaternion (-1..1), the colour, and the opacity.
+        First the means, M times three little-endian uint16. Then M times 11 uint8: three scales
+        (their logarithms over `LOG_SCALES`), the quaternion (-1..1), the colour, the opacity.
     """
     means, quats, scales, opacities, sh0 = (
         value.detach()[kept].numpy().astype(np.float64) for value in gaussians[:5]
@@ -223,14 +222,14 @@ def quantise(gaussians: ActivatedGaussians, kept: torch.Tensor) -> bytes:
 
 
 def _whole(values: NDArray[np.float64], kind: str) -> NDArray[np.unsignedinteger[Any]]:
-    """Spread 0..1 over the whole numbers of an unsigned type."""
+    """Scale 0..1 to the whole range of an unsigned integer type."""
     most = np.iinfo(kind).max
     whole: NDArray[np.unsignedinteger[Any]] = np.round(np.clip(values, 0, 1) * most).astype(kind)
     return whole
 
 
 def _originals(variant: Variant) -> Mapping[str, LoadedView]:
-    """Return the training views before they were degraded, by name; none where none were."""
+    """Return the training views before degradation, by name; {} if none is degraded."""
     if not any(view.split == "original" for view in variant.views):
         return {}
     return {view.name: view for view in dataset.load(variant, "all_hr").train}

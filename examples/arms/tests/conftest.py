@@ -1,4 +1,4 @@
-"""The arms as if they were installed, and what the tests of xrgs's own components share."""
+"""Installs the arms for the tests, and imports the fixtures of the tests of xrgs's components."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A killed run with all arms that have a state ends as one never killed."""
+"""A killed and resumed run ends like one that was never killed, with all arms that have a state."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from xrgs.training.loop import train
 
 
 class Kill(BaseException):
-    """Ends a run as a kill does."""
+    """Raised to end a run as a kill does."""
 
 
 @pytest.mark.parametrize("kill", [7, 13, 22])

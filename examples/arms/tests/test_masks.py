@@ -1,4 +1,4 @@
-"""What a mask hides changes nothing in the arms."""
+"""Pixels outside a mask change nothing in the arms."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ def test_before_its_end_the_filter_becomes_part_of_the_gaussians() -> None:
 
 
 def test_the_model_at_the_end_of_the_filter_is_the_one_with_it(data: Dataset) -> None:
-    """To the bit: what is evaluated then is what a training that keeps the filter evaluates."""
+    """The evaluated Gaussians are those of a training that keeps the filter, bit for bit."""
     found = []
     for until in (15_000, 30_000):
         late = ("+ablation=mip_off_late", f"components.plugins.mip_off_late.until={until}")

@@ -1,4 +1,4 @@
-"""Gradients of Gaussians close to a camera are lessened."""
+"""Gradients of Gaussians close to a camera are reduced."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_gradients_fall_with_the_square_of_the_depth(
 
 
 def test_a_view_without_points_in_its_image_lessens_nothing(looking: list[LoadedView]) -> None:
-    """All points are behind the only camera, and the Gaussians before it."""
+    """All points are behind the only camera, and the Gaussians in front of it."""
     (view,) = looking[:1]
     behind, before = (torch.tensor([[x, 0.1, 0.1]] * 5).double() for x in (9.0, 3.9))
     gaussians = gaussians_at(before)

@@ -46,7 +46,7 @@ def weighting(floor: float = 0.1) -> NoiseWeighting:
 def take(
     component: NoiseWeighting, name: str, residual: Tensor | float, number: int = 0
 ) -> tuple[float, dict[str, float]]:
-    """The factor of the loss at a step of 100 with that residual, and the step's log."""
+    """Return the factor on the loss at a step of 100 with this residual, and the step's log."""
     step = Step(number, 100, VIEWS[name])
     image = torch.as_tensor(residual).expand(*step.view.image.shape)
     loss = component.modify_loss(torch.tensor(2.0), image, NO_GAUSSIANS, step)
@@ -92,7 +92,7 @@ def test_residuals_are_compared_at_the_lowest_sampling_rate() -> None:
 
 
 def test_a_reduced_view_is_compared_at_the_same_rate() -> None:
-    """As `resolution_schedule` makes them early."""
+    """Early in a run, `resolution_schedule` makes such views."""
     component = weighting()
     reduced = replace(make_view("HR", torch.zeros(30, 38, 3).double()), name="h0")
     image = torch.full((30, 38, 3), 0.3).double()
@@ -155,7 +155,7 @@ def test_a_floor_of_1_is_off(build: Build, off: ComponentsConf) -> None:
 
 @pytest.fixture
 def noisy(data: Dataset) -> Dataset:
-    """The views of `data`, with an LR view of noise."""
+    """Return `data` with noise as the photograph of the last view."""
     *others, last = data.train
     return replace(data, train=(*others, replace(last, pixels=noise(12, 12, 5).float())))
 

@@ -1,4 +1,4 @@
-"""What the package offers, and what xrgs says of it."""
+"""The entry points of the package, and the identity of their cells."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ Build = Callable[..., Components]
 
 
 def skipping(**settings: float) -> SkipBackward:
-    """Steps may be skipped from the first one on."""
+    """Return the component with steps skipped from the first one on."""
     return SkipBackward(Settings(**{"share": 0.0, "begin": 0, **settings}))  # type: ignore[arg-type]
 
 

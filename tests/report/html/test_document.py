@@ -65,7 +65,7 @@ def test_the_page_of_one_cell_shows_the_scene_and_no_furniture_of_a_comparison(a
     ]
     assert parsed.texts["h1"][0] == "fern"
     data = data_of(alone)
-    assert data["alone"]
+    assert data["single"]
     assert data["mixed"] == (alone.parent.name == "mixed")
     assert [view["view"] for view in data["views"]] == ["IMG_009", "IMG_001"], "worst first"
     words = " ".join(text for tag, of in parsed.texts.items() if tag != "script" for text in of)
@@ -78,7 +78,7 @@ def test_the_page_of_one_cell_shows_the_scene_and_no_furniture_of_a_comparison(a
         "arms",
     ):
         assert furniture not in words
-    assert "not known, how the photographs were placed" in words
+    assert "it is unknown how the photographs were placed" in words
     terms, texts = ([text for text in parsed.texts[of] if text.strip()] for of in ("dt", "dd"))
     values = dict(zip(terms, texts, strict=True))
     assert values == {

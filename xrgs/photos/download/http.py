@@ -23,7 +23,7 @@ from xrgs.safeio.sanitize import for_line
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-#: Tries in succession that bring fewer than _LEAST_BYTES before a download is given up.
+#: A download is given up after this many successive tries with fewer than _LEAST_BYTES each.
 _TRIES = 6
 #: Seconds before the second try; each further pause is twice as long.
 _PAUSE_S = 1.0
@@ -70,7 +70,7 @@ def download(
     Raises:
         DownloadError: The file exists or can't be written; the server is unreachable, refuses, is
             too slow, redirects to another host, or sends a web page or more than `max_bytes`; or
-            the hash is another one.
+            the hash differs.
     """
     if not is_url(url):
         raise DownloadError(f"{url or 'an empty address'}: must begin with http:// or https://")
@@ -98,7 +98,7 @@ def download(
 
 
 class _Download:
-    """Requests what is missing of a file and appends it to a stream."""
+    """Requests the missing bytes of a file and appends them to a stream."""
 
     def __init__(
         self, url: str, stream: IO[bytes], version: Path, max_bytes: int, hosts: Iterable[str]
@@ -117,7 +117,7 @@ class _Download:
             try:
                 return self._receive()
             except _LostError as lost:
-                # A server without ranges begins again each time: only more than ever before counts.
+                # A server without ranges begins at 0 each time: a try must pass all before it.
                 failures = 0 if self._size >= most + _LEAST_BYTES else failures + 1
                 most = max(most, self._size)
                 if failures == _TRIES:
@@ -162,7 +162,7 @@ class _Download:
             raise _LostError(for_line(why, _MAX_WORDS)) from error
 
     def _begin(self, validator: str) -> None:
-        """Discard all bytes; bytes of the version with this validator follow."""
+        """Discard all bytes, and store the validator (ETag or date) of those that follow."""
         self._stream.seek(0)
         self._stream.truncate()  # first: no bytes may ever stand beside another version's validator
         write_text(self._version, f"{self._url}\n{validator}")
@@ -202,7 +202,7 @@ class _Download:
                     if self._size - before < _LEAST_BYTES:
                         raise _LostError(f"fewer than {_LEAST_BYTES} bytes in {_PERIOD_S:g} s")
                     since, before = monotonic(), self._size
-        # http.client takes headers that break off for whole ones: then nothing follows.
+        # http.client accepts headers that are cut off; then no bytes follow.
         if self._size == 0 or total not in (None, self._size):
             of = "" if total is None else f" of {total}"
             raise _LostError(f"the connection ended after {self._size}{of} bytes")

@@ -35,7 +35,7 @@ class DatasetConf:
 
 
 def fetch_scenes(conf: DatasetConf, names: Iterable[str], root: Path) -> str:
-    """Put scenes into a folder each; scenes that are there already are not touched.
+    """Put each scene into a folder of its own; scenes that are there already are not touched.
 
     Args:
         conf: The archive.

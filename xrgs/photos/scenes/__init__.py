@@ -40,7 +40,7 @@ __all__ = [
 
 #: Kinds whose photographs are in this package, or are rendered by it.
 _EMBEDDED = ("procedural", "motorcycle")
-#: The values of `scene.alpha`; the first changes no fingerprint.
+#: The values of `scene.alpha`. The first is the default, which is in no fingerprint.
 ALPHA = ("composite", "mask")
 
 
@@ -75,8 +75,9 @@ def fingerprint(conf: SceneConf, long_side: int = 0) -> str:
 
     Args:
         conf: The scene's config.
-        long_side: `variant.long_side`: the longer side of the HR views, px; 0 for the full size. A
-            folder may hold copies of several sizes, and the procedural scene is rendered in it.
+        long_side: `variant.long_side`: the longer side of the HR views, px; 0 for the full size. It
+            chooses among copies of several sizes in a folder, and the procedural scene is rendered
+            at this size.
 
     Raises:
         XrgsError: The kind is unknown, a value is out of its range, or the photographs are not
@@ -97,7 +98,7 @@ def fingerprint(conf: SceneConf, long_side: int = 0) -> str:
 
 
 def resolve(conf: SceneConf, cache: Path, long_side: int = 0) -> Scene:
-    """Find a scene's photographs on disk; frames and rendered views are made where they are not.
+    """Find a scene's photographs on disk; extract a video's frames, render the procedural scene.
 
     Args:
         conf: The scene's config.
@@ -121,7 +122,7 @@ def resolve(conf: SceneConf, cache: Path, long_side: int = 0) -> Scene:
 
 
 def _masks(conf: SceneConf, long_side: int) -> tuple[dict[str, Path], tuple[str, ...]]:
-    """Find the masks by the names of the photographs, and what is said of them."""
+    """Return the masks by the names of the photographs, and notes on them."""
     if conf.masks is None:
         return {}, ()
     if conf.kind == "folder":

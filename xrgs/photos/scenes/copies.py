@@ -1,7 +1,7 @@
 """Finds photographs that a folder has twice: byte for byte, in several sizes, in several formats.
 
-A view that is held out must not be trained on through its copy. Of each photograph one file is
-taken, and the others are named.
+A held-out view must not be trained on through its copy. One file of each photograph is taken, and
+notes name the others.
 """
 
 from __future__ import annotations
@@ -25,33 +25,34 @@ if TYPE_CHECKING:
 
 #: The names of LLFF's folders of one set of photographs: `images`, and `images_N`, N times smaller.
 SIZES = re.compile(r"images(?:_(\d+))?")
-#: The largest deviation of N from the ratio of the sizes; converters round to whole px.
+#: The largest relative deviation of N from the ratio of the sizes; converters round to whole px.
 _RATIO_TOLERANCE = 0.05
-#: Pairs of one name that are compared to find out how two folders are related.
+#: How many pairs of files are compared to find whether two folders have the same photographs.
 _SAMPLES = 3
-#: The sides of the thumbnails that are compared, px. In seven captures, neighbouring views have a
+#: The sides of fine and coarse thumbnails, px. In seven captures, neighbouring views have a
 #: correlation of 0.979 or less on fine ones, and of up to 0.997 on coarse ones. Photographs that
 #: were resized to 334 px and compressed anew have 0.997 or more on fine ones; resized to 80 px,
 #: 0.994 or more on coarse ones, and in their own size 0.9998. Fine ones decide whether two folders
 #: have the same photographs. Coarse ones decide for each pair of such folders, and for each pair of
 #: related names in one folder.
 _FINE, _COARSE = 64, 16
-#: The least correlation of the thumbnails of one photograph, in two sizes and in one.
+#: Two files show one photograph if their thumbnails have at least this correlation: for files of
+#: different sizes, and of one size.
 _LEAST_ALIKE, _LEAST_ALIKE_SIZE = 0.985, 0.9995
-#: The same where two files of a folder differ in format or by a phone's mark of an edit.
+#: The same for files of one folder whose names differ only in suffix or by a phone's edit mark.
 _LEAST_ALIKE_TWINS = 0.9
-#: What an iPhone adds to the name of a photograph that was edited on it.
+#: The edit mark in names of an iPhone: `IMG_E1234` is the edited `IMG_1234`.
 _EDITED = re.compile(r"(?<=^img_)e(?=\d)")
 #: The largest deviation of the aspect ratio of a resized copy.
 _ASPECT_TOLERANCE = 0.02
-#: The bytes at the end of a file among which the mark of its end is looked for.
+#: The end mark of a file's format is searched in this many last bytes.
 _TAIL_BYTES = 1 << 10
 _END_MARKS = {".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9", ".png": b"IEND"}
 
 
 @remembered
 def size(file: Path) -> tuple[int, int]:
-    """Return width and height of a photograph, px; zeros where its header can't be read."""
+    """Return width and height of a photograph, px; zeros if its header can't be read."""
     try:
         return images.size(file)
     except images.ImageError:
@@ -60,7 +61,7 @@ def size(file: Path) -> tuple[int, int]:
 
 @remembered
 def _is_whole(file: Path) -> bool:
-    """Return whether a file is not cut off; it is decoded where no mark is at its end."""
+    """Return whether a file is complete: by its end mark, or else by decoding it."""
     with file.open("rb") as stream:
         stream.seek(max(0, file.stat().st_size - _TAIL_BYTES))
         tail = stream.read()
@@ -71,7 +72,7 @@ def _is_whole(file: Path) -> bool:
 
 @remembered
 def _thumbnail(file: Path) -> NDArray[np.float64] | None:
-    """Return a grey thumbnail [_FINE, _FINE]; None where the file can't be read."""
+    """Return a grey thumbnail [_FINE, _FINE]; None if the file can't be read."""
     try:
         return np.asarray(images.thumbnail(file, _FINE), np.float64)
     except images.ImageError:
@@ -81,16 +82,16 @@ def _thumbnail(file: Path) -> NDArray[np.float64] | None:
 def one_of_each_size(
     folders: Sequence[Sequence[Path]], long_side: int
 ) -> tuple[list[Sequence[Path]], list[str]]:
-    """Take one of the sizes in which LLFF's folders have the same photographs.
+    """Choose one folder for each set of photographs that LLFF's folders have in several sizes.
 
     Args:
         folders: The photographs of each folder; the folders lie in one folder and match `SIZES`.
         long_side: `variant.long_side`, px. The smallest size that suffices is taken; the largest
-            where none does, or where this is 0. A folder that lacks photographs is not taken.
+            if none does, or if this is 0. A folder that lacks photographs is not taken.
 
     Returns:
-        The photographs of each set, and notes. Folders whose sizes differ by another factor than
-        their names say are different sets.
+        The photographs of each set, and notes. Folders whose sizes don't differ by the factor in
+        their names are different sets.
     """
     groups: list[list[Sequence[Path]]] = []
     for files in sorted(folders, key=_factor):
@@ -124,9 +125,9 @@ def _factor(files: Sequence[Path]) -> int:
 
 
 def _are_sizes(large: Sequence[Path], small: Sequence[Path]) -> bool:
-    """Return whether the sizes of two folders differ by the factor that their names say.
+    """Return whether the sizes of two folders differ by the factor in the folders' names.
 
-    LLFF's own copies have other names than its photographs.
+    Files are paired by name; LLFF's own copies have other names, so that all are compared then.
     """
     named = {file.stem: file for file in large if _is_whole(file)}
     both = [file for file in small if file.stem in named and _is_whole(file)]
@@ -148,13 +149,13 @@ def without_copies(
     """Leave out files that show the same photograph as another one.
 
     These are compared: files of the same bytes; files of one folder with names such as `a.jpg`,
-    `a.png`, `a_small.jpg` and `a (1).jpg`; files of one name in two folders; and the files of two
-    folders in their order, where the folders have as many.
+    `a.png`, `a_small.jpg` and `a (1).jpg`; files of one name in two folders; and files at the same
+    place in two folders with equally many files.
 
     Args:
         files: The files.
-        folder: The folder from which notes name the files.
-        other_sizes: Files that are taken in another size; their copies are left out, too.
+        folder: The folder to which paths in notes are relative.
+        other_sizes: Files that were left out for another size; their copies are left out, too.
 
     Returns:
         The files in their order, and notes.
@@ -181,7 +182,7 @@ def without_copies(
 
 
 def _identical(files: Sequence[Path], known: Set[Path]) -> dict[Path, Path]:
-    """Return the files that have the bytes of another or of a known one, with that one."""
+    """Map each file with the same bytes as another, or as a `known` one, to that file."""
     by_length = defaultdict(list)
     for file in (*known, *files):
         by_length[file.stat().st_size].append(file)
@@ -203,13 +204,13 @@ def _shortest(file: Path) -> tuple[int, str]:
 
 
 def _preference(file: Path) -> tuple[object, ...]:
-    """Sort first what is taken: larger, of a format that needs no other package, named shorter."""
+    """Return a sort key: larger files first, then formats other than HEIC, then short names."""
     width, height = size(file)
     return -width * height, _is_heic(file), *_shortest(file)
 
 
 def _of_one_folder(files: Sequence[Path]) -> list[tuple[Path, Path]]:
-    """Pair the files of a folder whose names differ in their suffix, or by an addition."""
+    """Pair files of one folder whose names differ only in suffix, or by an addition."""
     named = defaultdict(list)
     for file in files:
         named[file.parent, file.stem.casefold()].append(file)
@@ -218,7 +219,7 @@ def _of_one_folder(files: Sequence[Path]) -> list[tuple[Path, Path]]:
     for parent, stem in named:
         stems[parent].add(stem)
     for (parent, stem), group in named.items():
-        # A name is cut between words and numbers alone: `IMG_1` is no part of `IMG_10`.
+        # A name is only cut between words and numbers: `IMG_1` is no part of `IMG_10`.
         cuts = [i for i in range(1, len(stem)) if _kind(stem[i - 1]) != _kind(stem[i])]
         parts = {part for i in cuts for part in (stem[:i], stem[i:])} | {_EDITED.sub("", stem)}
         parts.discard(stem)
@@ -232,10 +233,10 @@ def _kind(char: str) -> tuple[bool, bool]:
 
 
 def _of_two_folders(files: Sequence[Path]) -> list[tuple[Path, Path]]:
-    """Pair the files of one name, or of one place in the order, in folders of the same photographs.
+    """Pair files by name, or by their place in the order, in folders of the same photographs.
 
-    Cameras number their photographs alike: folders whose first, middle and last pairs differ have
-    other photographs.
+    Since cameras number their photographs alike, the first, middle and last pair are compared
+    first; if they differ, the folders have different photographs.
     """
     folders: dict[Path, dict[str, Path]] = defaultdict(dict)
     for file in files:
@@ -253,13 +254,13 @@ def _of_two_folders(files: Sequence[Path]) -> list[tuple[Path, Path]]:
 
 
 def _samples(items: Sequence[tuple[Path, Path]]) -> Sequence[tuple[Path, Path]]:
-    """Return the first, the last and one between."""
+    """Return the first, the middle and the last item."""
     step = max(1, (len(items) - 1) // (_SAMPLES - 1)) if items else 1
     return items[::step][:_SAMPLES]
 
 
 def _show_the_same(a: Path, b: Path, side: int = _COARSE) -> bool:
-    """Return whether two files show one photograph, by their thumbnails of a side."""
+    """Return whether two files show one photograph, by thumbnails [side, side]."""
     twins = a.parent == b.parent and _as_shot(a) == _as_shot(b)
     if twins and any(_is_heic(file) and size(file) == (0, 0) for file in (a, b)):
         return True  # a phone writes both formats, and the package that reads HEIC is missing here
@@ -277,19 +278,19 @@ def _show_the_same(a: Path, b: Path, side: int = _COARSE) -> bool:
 
 
 def _as_shot(file: Path) -> str:
-    """Return the name that the formats of a photograph share, and an edited one with them."""
+    """Return a file's name without suffix and edit mark, which files of one photograph share."""
     return _EDITED.sub("", file.stem.casefold())
 
 
 def _averaged(thumbnail: NDArray[np.float64], side: int) -> NDArray[np.float64]:
-    """Average a thumbnail to a side that divides its own."""
+    """Average a thumbnail to [side, side]; `side` must divide its size."""
     block = len(thumbnail) // side
     blocks = thumbnail.reshape(side, block, side, block)
     return np.asarray(blocks.mean(axis=(1, 3)), np.float64)
 
 
 def _correlation(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
-    """Return the correlation of two pictures; 0 where one is flat."""
+    """Return the correlation of two pictures; 0 if one is flat."""
     if a.std() == 0 or b.std() == 0:
         return 0.0
     return float(np.corrcoef(a.ravel(), b.ravel())[0, 1])

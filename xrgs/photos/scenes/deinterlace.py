@@ -1,8 +1,8 @@
 """Deinterlaces videos, whose frames are woven of two fields that were taken one after the other.
 
-Such a frame shows what moves as a comb, and the comb passes for sharpness. Frames that the video
-marks as interlaced become pictures by FFmpeg's `bwdif`, as in a player. Where it marks none,
-`idet` compares the lines of each frame with the frames beside it, and marks those of two fields.
+In such a frame moving things have combed edges, which would count as sharpness. Frames that the
+video marks as interlaced are deinterlaced by FFmpeg's `bwdif`, as in a player. If it marks none,
+`idet` compares the lines of each frame with its neighbours, and marks those of two fields.
 """
 
 from __future__ import annotations
@@ -17,31 +17,31 @@ if TYPE_CHECKING:
     from av.filter.graph import Graph
     from av.video.frame import VideoFrame
 
-#: `idet` leaves its first frames undecided, so it is shown so many of them before.
+#: `idet` leaves its first frames undecided, so this many frames are fed to it twice.
 _WARM_UP = 12
-#: How much more lines of one field must differ from the frame before than those of the other.
-#: FFmpeg's own 1.04 marks frames of a camera that moves slowly; our choice.
+#: `idet` marks a frame if one field differs this many times more from the frame before it than the
+#: other field does. FFmpeg's own 1.04 marks frames of a camera that moves slowly; our choice.
 _LEAST_RATIO = 1.2
 _TIME_BASE = Fraction(1, 25)
 
 
 def deinterlaced(frames: Iterable[VideoFrame]) -> Iterator[VideoFrame]:
-    """Yield the frames of a video, those of two fields deinterlaced; as many as came in.
+    """Yield every frame of a video; those of two fields are deinterlaced.
 
-    Frames of RGB stay as they are. The times of the others are changed.
+    RGB frames stay as they are; all others get new times.
     """
     for _, alike in groupby(frames, _layout):
         yield from _filtered(alike)
 
 
 def _layout(frame: VideoFrame) -> tuple[int, int, str, int, int]:
-    """Return what a graph of filters is made for."""
+    """Return the properties of a frame for which a filter graph is made."""
     colours = int(frame.colorspace), int(frame.color_range)
     return frame.width, frame.height, frame.format.name, *colours
 
 
 def _graph(warm_up: Sequence[VideoFrame]) -> Graph:
-    """Return a source of frames, the filters, and a sink."""
+    """Build the filter graph: a source of frames, the filters and a sink."""
     from av.filter import Graph
 
     width, height, pixels, matrix, levels = _layout(warm_up[0])
@@ -63,7 +63,7 @@ def _graph(warm_up: Sequence[VideoFrame]) -> Graph:
 
 
 def _filtered(frames: Iterator[VideoFrame]) -> Iterator[VideoFrame]:
-    """Yield frames of one layout as the filters leave them."""
+    """Yield filtered frames; all have one layout."""
     import av
 
     warm_up = [*islice(frames, _WARM_UP)]

@@ -37,8 +37,8 @@ if TYPE_CHECKING:
 
     from xrgs.config import SceneConf
 
-#: Those of images that are not read: raw files, stereo pairs and pictures of two fisheye lenses in
-#: one file, thumbnails, and formats that no camera of today writes.
+#: Suffixes of images that are not read: raw files, stereo pairs and pictures of two fisheye lenses
+#: in one file, thumbnails, and formats that no camera of today writes.
 _OTHER_IMAGES = frozenset(
     {".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dcr", ".dng", ".erf", ".fff", ".gpr", ".iiq", ".kdc"}
     | {".mef", ".mos", ".mrw", ".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl"}
@@ -52,7 +52,7 @@ VIDEOS = frozenset(
     | {".mpeg", ".mpg", ".mts", ".ogv", ".webm", ".wmv"}
 )
 _ARCHIVES = frozenset({".7z", ".gz", ".rar", ".tar", ".tgz", ".xz", ".zip"})
-#: What programs make around photographs, by the entries of the folder that tell it.
+#: Folders that programs make -> the entries by which they are recognised.
 _MADE = {
     "a store of xrgs": ("cells", "variants"),
     "a variant of xrgs": ("variant.json",),
@@ -60,10 +60,10 @@ _MADE = {
     "a report of xrgs": ("cells.csv", "table.md"),
     "an export of xrgs": ("split.json", "transform.json"),
 }
-#: What else is not taken with `/**`, in words for people.
+#: Further reasons why `/**` leaves folders out, in the words of the notes.
 _MASKS, _LINKS, _SYSTEM = "masks", "links to folders are not followed", "folders of the system"
 _UNDISTORTED = "copies that COLMAP undistorted"
-#: Folders of thumbnails, of what was deleted, and of other files that systems keep beside files.
+#: Names of folders that operating systems make: thumbnails, bins and the like.
 _OF_SYSTEM = frozenset(
     {"#recycle", "$recycle.bin", "@eadir", "__macosx", "lost+found", "system volume information"}
 )
@@ -74,7 +74,7 @@ _OF_OTHERS = re.compile(
     r"(?:[\W_\d].*)?",
     re.IGNORECASE,
 )
-#: The deepest nesting of folders that is searched, and what is said of those below it.
+#: The deepest nesting of folders that is searched, and the note on deeper ones.
 _MAX_DEPTH = 8
 _DEEP = f"nested more than {_MAX_DEPTH} folders deep; move them up"
 
@@ -112,22 +112,22 @@ def list_photographs(path: str | None, long_side: int, masks: str | None = None)
 
 
 def look(path: str | None, long_side: int, masks: str | None = None) -> Listing:
-    """List the image files of a scene's folder, and say what is not among them.
+    """List the image files of a scene's folder, with notes on what was left out.
 
     Args:
         path: `scene.path`, the folder; with `/**` at its end, all folders below it too.
         long_side: `variant.long_side`, px. Of an LLFF scene the smallest copies whose longer side
-            has at least so many px are taken; the largest where none has, or where this is 0.
-        masks: `scene.masks`, a folder that is not looked into; None where there is none.
+            is at least this long are taken; the largest if none is, or if this is 0.
+        masks: `scene.masks`, a folder that is skipped; None if there is none.
 
     Returns:
         The files and the notes. The name of a view is the name of the file without its suffix; with
-        `/**` the folders on the way come before it, joined by `_`.
+        `/**` the names of the folders between come before it, joined by `_`.
 
     Raises:
         UnreadableError: The folder or a file in it can't be read now.
-        XrgsError: The folder is missing, has fewer than two images that can be used or two of one
-            name, or images are HEIC and the package that reads it is not installed.
+        XrgsError: The folder is missing, has fewer than two usable images, or two of one name; or
+            there are HEIC images, and the package that reads them is not installed.
     """
     if not path:
         raise XrgsError("scene.path is empty: give the folder of photographs, scene.path=...")
@@ -146,7 +146,7 @@ def look(path: str | None, long_side: int, masks: str | None = None) -> Listing:
         not_read = _not_read({folder, *found.folders}, files)
         grey = _grey(files, folder)
         said = (*found.notes, *unnamed, *made, *copies, *shapes, *grey, *_rare(files), *not_read)
-        notes = tuple(map(for_line, said))  # names in them may be no text, which no file takes
+        notes = tuple(map(for_line, said))  # names in them may not be valid text
     except OSError as error:
         raise UnreadableError(f"{error.filename}: {error.strerror}; try again") from error
     if len(files) < 2:
@@ -169,7 +169,7 @@ class _Found:
     folders: _Tree
     notes: list[str]
     other_sizes: list[Path]
-    """Images in folders of an LLFF scene of which another size is taken."""
+    """Images of an LLFF scene that are left out, since another size is taken."""
 
 
 def _inside(folder: Path, long_side: int, masks: Path | None) -> _Found:
@@ -186,10 +186,10 @@ def _inside(folder: Path, long_side: int, masks: Path | None) -> _Found:
 
 
 def _all_below(folder: Path, long_side: int, masks: Path | None) -> _Found:
-    """List the photographs in a folder and all below it, of LLFF scenes those of one size."""
+    """List the photographs in a folder and all below it; of an LLFF scene only one size."""
     passed: dict[str, list[Path]] = defaultdict(list)
     tree = {inside: _images_in(inside) for inside in _folders(folder, passed, masks)}
-    if not any(tree.values()):  # the undistorted ones are all there is
+    if not any(tree.values()):  # there are only undistorted copies
         tree |= {inside: _images_in(inside) for inside in passed.pop(_UNDISTORTED, ())}
     dropped, notes = _other_sizes(tree, long_side)
     root = folder.resolve()
@@ -204,7 +204,7 @@ def _all_below(folder: Path, long_side: int, masks: Path | None) -> _Found:
 
 
 def _other_sizes(tree: _Tree, long_side: int) -> tuple[list[Path], list[str]]:
-    """Return the folders of the LLFF scenes among folders of which another size is taken."""
+    """Return the folders of LLFF scenes that are left out for another size, and notes."""
     groups = defaultdict(list)
     for inside, files in tree.items():
         if files and SIZES.fullmatch(inside.name):
@@ -220,9 +220,9 @@ def _other_sizes(tree: _Tree, long_side: int) -> tuple[list[Path], list[str]]:
 def _folders(
     folder: Path, passed: dict[str, list[Path]], masks: Path | None, depth: int = 0
 ) -> Iterator[Path]:
-    """Yield a folder and all below it that may hold photographs; add the others to `passed`.
+    """Yield a folder and all below it that may hold photographs.
 
-    Hidden folders and the folder of `scene.masks` are passed over in silence.
+    The others are added to `passed`, by the reason; hidden folders and `scene.masks` are not.
     """
     yield folder
     for inside in sorted(folder.iterdir()):
@@ -239,7 +239,7 @@ def _folders(
 
 
 def _made_by_programs(folder: Path) -> str:
-    """Say what a folder holds in place of photographs; empty where it may hold photographs."""
+    """Say what a folder holds in place of photographs; empty if it may hold photographs."""
     if folder.name.casefold() in _OF_SYSTEM:
         return _SYSTEM
     # `image_undistorter` makes stereo/; 3DGS's script keeps the photographs in input/.
@@ -300,7 +300,7 @@ def _masks_left_out(passed: Mapping[str, Sequence[Path]], folder: Path) -> list[
 
 
 def _left_out(counts: Mapping[Path, int], folder: Path, why: str) -> list[str]:
-    """Say how many images are left out in which folders; nothing where there are none."""
+    """Return a note on how many images are left out in each folder; none if there are none."""
     where = [
         f"{count} in {inside.relative_to(folder) if inside != folder else 'it'}"
         for inside, count in sorted(counts.items())
@@ -310,7 +310,7 @@ def _left_out(counts: Mapping[Path, int], folder: Path, why: str) -> list[str]:
 
 
 def _not_a_folder(file: Path) -> str:
-    """Say what a file is that was given in place of a folder, and what to do."""
+    """Say what to do with a file that was given in place of a folder."""
     suffix = file.suffix.lower()
     if suffix in _ARCHIVES:
         return f"an archive ({suffix}), not a folder; unpack it, and give the folder"
@@ -321,7 +321,7 @@ def _not_a_folder(file: Path) -> str:
 
 
 def _rare(files: Sequence[Path]) -> list[str]:
-    """Name the photographs whose suffixes are not those of photographs of today."""
+    """Note the photographs with unusual suffixes, which were recognised by their content."""
     rare = [file.name for file in files if file.suffix.lower() not in images.USUAL_SUFFIXES]
     return [f"taken as photographs by what is in the files: {listed(rare)}"] if rare else []
 
@@ -376,7 +376,7 @@ def _is_grey(file: Path) -> bool:
 def _named(
     files: Sequence[Path], folder: Path, *, nested: bool
 ) -> tuple[dict[Path, str], list[str]]:
-    """Name the views of files; leave out files whose names can't be used, and say so."""
+    """Return the view's name of each file, and a note on files whose names can't be used."""
     names = {
         file: "_".join(file.relative_to(folder if nested else file.parent).with_suffix("").parts)
         for file in files
@@ -384,7 +384,7 @@ def _named(
     unusable = [file for file, name in names.items() if not is_name(name)]
     if not unusable:
         return names, []
-    # As Python writes them: a line break, or bytes that are no text, can't be shown.
+    # By `repr`, since line breaks and invalid bytes can't be shown.
     shown = listed([repr(str(file.relative_to(folder))) for file in unusable])
     why = "a backslash, a control character or bytes that are not valid Unicode, or is too long"
     notes = [f"{counted(len(unusable), 'image')} left out, whose name has {why}; rename: {shown}"]
@@ -392,7 +392,7 @@ def _named(
 
 
 def _by_name(named: Sequence[tuple[str, Path]]) -> dict[str, Path]:
-    """Return files by name, sorted; refuse two names that are one."""
+    """Return files by name, sorted; refuse two files with one name."""
     seen: dict[str, Path] = {}
     for name, file in named:
         # On some file systems A and a, or an accent as one or two characters, are one name.
@@ -422,7 +422,7 @@ def _is_size(folder: Path) -> bool:
 def _images_in(folder: Path) -> list[Path]:
     """List the regular files that are photographs, and the links to such files, sorted.
 
-    The suffix tells, and the first bytes of files whose suffix is no image's.
+    The suffix decides, or the first bytes of a file without a known suffix.
     """
     known = [file for file in _with_suffix(folder, images.SUFFIXES) if file.is_file()]
     return sorted(known + [file for file in _of_no_suffix(folder) if _told(file)])
@@ -440,7 +440,7 @@ def _of_no_suffix(folder: Path) -> list[Path]:
 
 @remembered
 def _told(file: Path) -> bool | None:
-    """Tell a photograph by its first bytes; a file that can't be read is none."""
+    """Return `images.is_photograph`; False if the file can't be read."""
     try:
         return images.is_photograph(file)
     except OSError:

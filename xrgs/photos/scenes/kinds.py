@@ -20,7 +20,7 @@ _FOLDER = "photos/scenes"
 def code_of(kind: str) -> str:
     """Return the digest of the code that provides the photographs of a kind of scenes.
 
-    It is every file of `photos/` but those of other kinds, and those that download photographs.
+    It covers every file of `photos/` except those of other kinds and of `download/`.
     """
     code = CodeFolders(
         folders=("photos",),
@@ -40,5 +40,5 @@ KINDS: dict[str, SceneKind] = {
     "folder": FolderScene(),
     "video": VideoScene(code_of),
 }
-#: Kinds that render or extract their photographs; what they hash has their code.
+#: Kinds that render or extract their photographs. Their own `digest` includes their code.
 MADE = ("procedural", "video")

@@ -1,4 +1,4 @@
-"""Leaves out images that programs made of the photographs beside them, as masks and depth maps."""
+"""Leaves out images that programs made from photographs, such as masks and depth maps."""
 
 from __future__ import annotations
 
@@ -18,17 +18,20 @@ from xrgs.safeio.sanitize import counted
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-#: What a name has before or after the name of the photograph that an image was made of.
+#: Words that programs add before or after a photograph's name in the name of an image made of it.
 _ADDED = rf"(?:{WORDS}|depth|disparity|normals?|thumb|thumbnail)"
 _ADDED_BEFORE = re.compile(rf"^{_ADDED}[\W_]?")
 _ADDED_AFTER = re.compile(rf"[\W_]?{_ADDED}(?:[\W_]?\d+)?$")
 _SEPARATOR = re.compile(r"[\W_]+")
-#: The least share of the values of a mask of three channels that is 0 or 1.
+#: An image of three channels is a mask if more than this share of its values is 0 or 1.
 _SHARE_OF_ENDS = 0.95
 
 
 def without_made(files: Sequence[Path], folder: Path) -> tuple[list[Path], list[str]]:
-    """Leave out images that were made of photographs, and say so; images of xrgs alone are kept."""
+    """Leave out images that were made of photographs, with notes.
+
+    Images that xrgs wrote are kept if there are no others.
+    """
     own = {file for file in files if _is_own(file)}
     if len(own) == len(files):
         own = set()
@@ -56,7 +59,7 @@ def _is_own(file: Path) -> bool:
 
 @remembered
 def is_mask(file: Path) -> bool:
-    """Return whether an image has one channel, or hardly another value than 0 and the largest."""
+    """Return whether an image has one channel, or nearly all of its values are 0 or 1."""
     try:
         pixels = None if not images.has_colour(file) else images.decode(file).pixels
     except images.ImageError:
@@ -67,9 +70,9 @@ def is_mask(file: Path) -> bool:
 def _made_of_others(files: Sequence[Path]) -> set[Path]:
     """Find masks, depth maps and thumbnails by the names of their photographs.
 
-    These are `a.jpg.png` and `a_mask.png` where there is an `a.jpg`, and an image of one channel
-    or of two values where another one of the same name, or of a part of its name, is a photograph.
-    The first image of a folder, or of those with the same addition to the name, stands for all.
+    Beside `a.jpg`, these are `a.jpg.png` and `a_mask.png`; and `a.png` or `a_x.png` if they have
+    one channel or two values and `a.jpg` does not. Only the first image of a folder, or of those
+    with the same addition to the name, is decoded; it stands for the others.
     """
     named = defaultdict(list)
     for file in files:
@@ -80,7 +83,7 @@ def _made_of_others(files: Sequence[Path]) -> set[Path]:
     extended: dict[tuple[Path, str], list[tuple[Path, Path]]] = defaultdict(list)
     for stem, group in named.items():
         plain = {_ADDED_BEFORE.sub("", stem), _ADDED_AFTER.sub("", stem)} - {stem}
-        of_whole_name = stem in names and names[stem] not in group  # or it has no suffix
+        of_whole_name = stem in names and names[stem] not in group  # not itself, without suffix
         if of_whole_name or plain & known.keys():
             made |= {*group}
             continue
@@ -100,7 +103,7 @@ def _made_of_others(files: Sequence[Path]) -> set[Path]:
 
 
 def _parts(stem: str) -> Iterator[tuple[str, str]]:
-    """Yield each beginning and end of a name between separators, and what is added to it there."""
+    """Split a name at each separator; yield each part, and the rest with the separator."""
     for found in _SEPARATOR.finditer(stem):
         yield stem[: found.start()], stem[found.start() :]
         yield stem[found.end() :], stem[: found.end()]

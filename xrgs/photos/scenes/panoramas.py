@@ -19,29 +19,30 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-#: A picture that is longer for its width than this, and so many times longer than the others, is
-#: called a panorama. It would set the size of all others, and SfM can't place it. Our choice.
+#: A picture is a panorama if its aspect ratio is above _PANORAMA, and above _TIMES the others'
+#: median. It would set the size of all others, and SfM can't place it. Our choice.
 _PANORAMA, _TIMES = 2.2, 1.6
-#: All directions are twice as many degrees around as from below to above.
+#: The aspect ratio of a picture of all directions, 360 x 180 degrees, and its relative tolerance.
 _ASPECT, _ASPECT_TOLERANCE = 2.0, 0.01
-#: The side at which pictures of this shape are looked at, px.
+#: The side of the thumbnails by which such pictures are tested, px.
 _SIDE = 128
-#: In such a picture the left edge goes on at the right: the two differ by no more than this many
-#: times what neighbouring columns do. The rows at the top and the bottom, which are a point each,
-#: vary by no more than this share of the quarter of rows that vary most (there may be a plain sky).
-#: Of 376 ordinary photographs none had the first, and 19 the second.
+#: In such a picture the left edge continues at the right: the two edge columns differ at most
+#: _MOST_STEP times as much as neighbouring columns. The top and the bottom row show one point each:
+#: their deviation is at most _MOST_VARIATION of the rows' upper quartile (the sky may be plain). Of
+#: 376 ordinary photographs none met the first condition, and 19 the second.
 _MOST_STEP, _MOST_VARIATION = 1.3, 0.4
-#: The columns at an edge, and how much they differ at least, as a share of what others do.
+#: How many columns at each edge must have texture, and its least amount: the mean difference of
+#: neighbouring columns there, relative to the median one.
 _NEAR_EDGE, _LEAST_STEP = 8, 0.4
-#: How much the two edges change alike from row to row, and over how many rows: noise does not.
+#: The least correlation of the two edges' changes over _ROWS rows: noise has none.
 _LEAST_CORRELATION, _ROWS = 0.4, 4
 
 
 def without_panoramas(files: Sequence[Path], folder: Path) -> tuple[list[Path], list[str]]:
     """Leave out panoramas, and name other pictures of their shape.
 
-    They are told by what their metadata say of the projection, by the picture of all directions,
-    and by a shape that the other photographs have not.
+    A panorama is recognised by the projection in its metadata, by a picture of all directions, or
+    by a shape unlike the other photographs'.
     """
     reasons = {file: why for file in files if (why := _projection(file))}
     aspects = {
@@ -69,7 +70,7 @@ def without_panoramas(files: Sequence[Path], folder: Path) -> tuple[list[Path], 
 
 @remembered
 def _projection(file: Path) -> str:
-    """Say why a file is a panorama, whatever the other files are; empty where it is none."""
+    """Say why a file is a panorama, by its metadata or content; empty if it is none."""
     try:
         if name := exif.read(file).projection:
             return f"left out as panoramas, by their metadata ({name})"
@@ -81,11 +82,11 @@ def _projection(file: Path) -> str:
 
 
 def is_of_all_directions(size: tuple[int, int], small: Callable[[int], NDArray[np.uint8]]) -> bool:
-    """Tell by its content whether a picture shows all directions, 360 by 180 degrees.
+    """Return whether a picture shows all directions, 360 by 180 degrees, by its shape and edges.
 
     Args:
-        size: Its width and height, px.
-        small: Returns it grey and square [S, S] for a side S; called where it has the shape.
+        size: Width and height of the picture, px.
+        small: Returns the picture in grey, [S, S], for a side S; called only if the shape fits.
     """
     width, height = size
     if not height or abs(width / height / _ASPECT - 1) > _ASPECT_TOLERANCE:
@@ -98,7 +99,7 @@ def is_of_all_directions(size: tuple[int, int], small: Callable[[int], NDArray[n
 
 @remembered
 def _goes_around(file: Path) -> bool:
-    """Tell whether a file that is wide enough may show 360 degrees, though not all directions."""
+    """Return whether a wide picture may show 360 degrees around, by its edges."""
     try:
         width, height = size(file)
         wide = width > (1 - _ASPECT_TOLERANCE) * _ASPECT * height
@@ -108,10 +109,10 @@ def _goes_around(file: Path) -> bool:
 
 
 def _has_one_edge(grey: NDArray[np.float64]) -> bool:
-    """Tell whether the left edge of a picture [S, S] goes on at the right."""
+    """Return whether the left edge of a picture [S, S] continues at the right."""
     steps = np.abs(np.diff(grey, axis=1)).mean(axis=0)
     usual = np.median(steps)
-    # A plain background goes on at the other side too, but has nothing to tell it by.
+    # The edges must have texture: any plain background continues at the other side.
     edges = min(steps[:_NEAR_EDGE].mean(), steps[-_NEAR_EDGE:].mean())
     around = np.abs(grey[:, 0] - grey[:, -1]).mean() <= _MOST_STEP * usual
     left, right = (grey[_ROWS:] - grey[:-_ROWS]).T[[0, -1]]

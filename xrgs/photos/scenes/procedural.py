@@ -31,7 +31,7 @@ _FOCUS = np.array([0.0, 0.1, 5.5])  # the point that every camera looks at
 _START = np.array([0.7, 0.55, 0.5])  # first position, as a fraction of the cameras' box
 _HALF_SIZE = np.array([1.1, 0.7, 0.4])  # half the size of the cameras' box
 
-#: By the name of a texture, its file in scikit-image's wheel and the RGB tint it is multiplied by.
+#: Name of a texture -> its file in scikit-image's wheel, and the RGB tint that multiplies it.
 TEXTURES: dict[str, tuple[str, tuple[float, float, float]]] = {
     "astronaut": ("astronaut.png", (1, 1, 1)),
     "bark": ("gravel.png", (0.75, 0.5, 0.35)),
@@ -55,7 +55,7 @@ class ProceduralScene:
     """The embedded scene: its views are rendered once, and their exact cameras are known."""
 
     code: Callable[[str], str]
-    """The digest of the code of a kind of scenes."""
+    """Returns the digest of the code of a kind of scenes."""
 
     def names(self, conf: SceneConf, long_side: int) -> list[str]:  # noqa: ARG002
         """Return the names of the views."""
@@ -69,7 +69,7 @@ class ProceduralScene:
         return digest([camera_size(long_side), conf.views, textures, self.code("procedural")])
 
     def resolve(self, conf: SceneConf, long_side: int, home: Path) -> Scene:
-        """Render the views where they are not there."""
+        """Render the views, unless they are there."""
         exact = dict(zip(names(conf.views), viewmats(conf.views), strict=True))
 
         def render(folder: Path) -> None:

@@ -190,17 +190,15 @@ def render(
     height: int,
     supersample: int = 3,
 ) -> Tensor:
-    """Render the image [height, width, 3] in 0..1 that a pinhole camera takes of solids.
-
-    It is black where no solid is hit.
+    """Render solids by a pinhole camera: [height, width, 3] in 0..1, black where no solid is hit.
 
     Args:
         solids: The solids, in world units.
         textures: Pyramids of [3, h, w] by name, see `pyramid`.
         K: Intrinsics [3, 3], px; pixel centres at +0.5.
         viewmat: World to camera [4, 4], OpenCV axes.
-        width: px.
-        height: px.
+        width: Width of the image, px.
+        height: Height of the image, px.
         supersample: The number of evenly spaced samples per pixel along each axis.
     """
     K, viewmat = K.float(), viewmat.float()

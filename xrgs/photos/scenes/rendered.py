@@ -38,13 +38,12 @@ class RenderedScene(Struct, frozen=True):
 
 
 def provide(home: Path, views: Sequence[str], render: Callable[[Path], None]) -> dict[str, Path]:
-    """Verify rendered images, and render them where they are not there or damaged.
+    """Verify rendered images, and render them if they are missing or damaged.
 
     Any number of processes may call this at once. A damaged folder is renamed, not removed.
 
     Args:
-        home: The folder, named by the scene's fingerprint; the one above it is made where it is
-            missing.
+        home: The scene's folder, named by its fingerprint; its parent is made if missing.
         views: The names of the views.
         render: Writes `<view>.png` for each view into the folder that it is given.
 
@@ -73,7 +72,7 @@ def provide(home: Path, views: Sequence[str], render: Callable[[Path], None]) ->
 
 
 def _damage(home: Path, images: Sequence[str]) -> StoreError | None:
-    """Return the first thing that is wrong with a rendered scene; None where it is intact."""
+    """Return the first error of a rendered scene; None if it is intact."""
     try:
         files = _files(home)
     except StoreError as error:
@@ -97,7 +96,7 @@ def _files(home: Path) -> dict[str, str]:
 
 
 def _render(home: Path, images: Sequence[str], render: Callable[[Path], None]) -> None:
-    """Render into another folder, after what a killed process left of it is removed."""
+    """Render into a temporary folder and rename it; first remove what a killed process left."""
     work = home.with_name(f".{home.name}.rendering")
     remove_path(work)
     work.mkdir()
@@ -117,7 +116,7 @@ def _render(home: Path, images: Sequence[str], render: Callable[[Path], None]) -
 def verify(home: Path) -> list[str]:
     """Return a line for each file of a rendered scene that is wrong; none for an intact scene.
 
-    A file is wrong that is missing, has changed, can't be read now or does not belong there.
+    A file is wrong if it is missing, has changed, can't be read now or does not belong there.
     """
     try:
         files = _files(home)

@@ -1,4 +1,4 @@
-"""What all kinds of scenes share: the dataclass, the protocol of a kind, and checks."""
+"""The common parts of all kinds of scenes: the dataclass, the protocol of a kind, and checks."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ if TYPE_CHECKING:
 
 _Read = TypeVar("_Read")
 
-#: The end of a path that stands for all folders below it.
+#: The end of a `scene.path` that includes all folders below.
 ALL_BELOW = "/**"
-#: What is read of a file is remembered once the file is unchanged for so long; FAT's times have a
-#: resolution of two seconds.
+#: `remembered` keeps a result once the file has been unchanged for this long, ns; FAT's times have
+#: a resolution of two seconds.
 _SETTLED_NS = 2 * 10**9
 
 
 @dataclass(frozen=True)
 class Scene:
-    """The photographs of a scene, and the cameras where they are known.
+    """The photographs of a scene, and the cameras if they are known.
 
     The key of all mappings is the name of a photograph, which is also the name of its view.
     """
@@ -43,7 +43,7 @@ class Scene:
     name: str
     """The name of the scene in tables."""
     fingerprint: str
-    """A hash of the photographs' names and bytes, or of what they are rendered from."""
+    """A hash of the photographs' names and bytes, or of the code and values that render them."""
     files: Mapping[str, Path]
     """The photographs, sorted by name."""
     intrinsics: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
@@ -53,9 +53,9 @@ class Scene:
     """Exact world-to-camera matrices [4, 4]. SfM never gets them: its poses are compared with
     them."""
     masks: Mapping[str, Path] = field(default_factory=dict)
-    """The mask of each photograph that has one; white is used."""
+    """The mask of each photograph that has one; white pixels are used."""
     alpha: str = "composite"
-    """What transparent pixels are: laid over `background`, or outside a `mask`."""
+    """`composite` lays transparent pixels over `background`; `mask` leaves them out."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """RGB in 0..1."""
     notes: tuple[str, ...] = ()
@@ -66,8 +66,8 @@ class SceneKind(Protocol):
     """A source of photographs.
 
     A new kind is one module of this folder, named after the value of `scene.kind`, and one line in
-    `xrgs.photos.scenes.kinds.KINDS`. The key of a variant has what `digest` returns and the code of
-    the kind, and not the code of the others.
+    `xrgs.photos.scenes.kinds.KINDS`. The key of a variant includes what `digest` returns and the
+    code of its own kind only.
     """
 
     def names(self, conf: SceneConf, long_side: int) -> list[str]:
@@ -84,7 +84,7 @@ class SceneKind(Protocol):
     def digest(self, conf: SceneConf, long_side: int) -> str:
         """Hash all that decides the photographs, without decoding or rendering them.
 
-        A kind of `MADE` hashes its code, too.
+        A kind of `xrgs.photos.scenes.kinds.MADE` hashes its code, too.
         """
 
     def resolve(self, conf: SceneConf, long_side: int, home: Path) -> Scene:
@@ -101,8 +101,8 @@ class SceneKind(Protocol):
 def label(conf: SceneConf) -> str:
     """Return the scene's name in tables: one printable line of at most 200 characters.
 
-    It is `scene.name`; where that is empty, the name of the folder or the video, or else the kind.
-    A folder called `images` has the name of the folder around it.
+    It is `scene.name`; if that is empty, the name of the folder or the video, or else the kind. For
+    a folder called `images` it is the name of its parent.
     """
     name = conf.name
     if not name and conf.path:
@@ -117,7 +117,7 @@ def scene_name(path: Path) -> str:
 
 
 def check_views(conf: SceneConf) -> None:
-    """Refuse fewer than two views of a kind that makes as many as `scene.views` says."""
+    """Refuse a `scene.views` below two, for kinds that make their views."""
     if conf.views < 2:
         raise XrgsError(f"scene.views={conf.views}: must be 2 or more")
 
@@ -138,8 +138,8 @@ def content(file: Path) -> str:
     """Hash the bytes of a photograph: 64 hexadecimal digits of a SHA-256.
 
     Raises:
-        UnreadableError: The file can't be read now. It is not left out: the scene would be another
-            one whenever a disk or a server fails.
+        UnreadableError: The file can't be read now. To leave it out would change the scene whenever
+            a disk or a server fails.
     """
     try:
         return _digest(file)
@@ -149,7 +149,7 @@ def content(file: Path) -> str:
 
 
 def remembered(read: Callable[[Path], _Read]) -> Callable[[Path], _Read]:
-    """Make a function of a file remember its results while the file's size and times stay.
+    """Cache the results of a function of a file, while the file's size and times stay the same.
 
     A sweep asks several times for names, hashes and sizes of the same photographs.
     """

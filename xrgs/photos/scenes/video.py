@@ -1,8 +1,8 @@
 """Takes the sharpest frames of a video, evenly spread, as the photographs of a scene.
 
-The frames are divided into as many parts as views are wanted, and the sharpest of each part is
-taken. Sharpness is the variance of the Laplacian of the brightness [pechpacheco2000], at a reduced
-size, where the noise of the sensor counts little. Frames are taken as a player shows them: with
+The frames are divided into `scene.views` equal parts, and the sharpest of each part is taken.
+Sharpness is the variance of the Laplacian of the brightness [pechpacheco2000], at a reduced size,
+at which the noise of the sensor counts little. Frames are taken as a player shows them: with
 square pixels, upright, deinterlaced and in sRGB. HDR is refused, as in photographs. Nothing here
 imports av before frames are read.
 """
@@ -48,8 +48,8 @@ _log = logging.getLogger(__name__)
 _SHARPNESS_SIDE = 640
 #: The containers that are read, by FFmpeg's names. Others, such as playlists, lead to other files.
 _CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg"
-#: H.273's number of a matrix that is not named, and the rows from which on players then take that
-#: of BT.709; for smaller frames they take that of BT.601.
+#: H.273's number of an unnamed matrix. For it players take BT.709's from this many rows on, and
+#: BT.601's for smaller frames.
 _UNKNOWN_MATRIX, _HD_ROWS = 2, 720
 
 
@@ -59,7 +59,7 @@ class _Frame:
 
     decoded: VideoFrame
     encoding: colour.Encoding | None
-    """The colours that the video names; None where they are sRGB's or not named."""
+    """The colours that the video names; None if they are sRGB's or not named."""
     size: tuple[int, int]
     """Width and height with square pixels, before it is turned, px."""
 
@@ -69,7 +69,7 @@ class VideoScene:
     """The sharpest frames of a video, which are extracted once."""
 
     code: Callable[[str], str]
-    """The digest of the code of a kind of scenes."""
+    """Returns the digest of the code of a kind of scenes."""
 
     def names(self, conf: SceneConf, long_side: int) -> list[str]:  # noqa: ARG002
         """Return the names of the frames: `frame_0000`, `frame_0001`, ..."""
@@ -95,14 +95,14 @@ class VideoScene:
         return digest([content, conf.views, self.code("video")])
 
     def resolve(self, conf: SceneConf, long_side: int, home: Path) -> Scene:
-        """Extract the frames where they are not there."""
+        """Extract the frames, unless they are there."""
         views, file = self.names(conf, long_side), _file(conf.path)
         files = rendered.provide(home, views, lambda work: extract(file, views, work))
         return Scene(label(conf), home.name, files, notes=_notes(file))
 
 
 def _notes(file: Path) -> tuple[str, ...]:
-    """Say which of several streams is read, as long as the video is there."""
+    """Note that only the first of several streams is read; no note if the video is gone."""
     import av
 
     try:
@@ -119,7 +119,7 @@ def _notes(file: Path) -> tuple[str, ...]:
 
 
 def _streams(container: InputContainer) -> list[VideoStream]:
-    """Return the video streams of a file, without pictures of its cover."""
+    """Return the video streams of a file, without cover pictures."""
     from av.stream import Disposition
 
     cover = Disposition.attached_pic
@@ -164,9 +164,9 @@ def extract(file: Path, names: Sequence[str], folder: Path) -> None:
 
 
 def sharpest(sharpness: list[float], parts: int) -> list[int]:
-    """Return the index of the largest value of each of some equal parts of a list.
+    """Divide a list into equal parts; return the index of the largest value of each part.
 
-    The sizes of the parts differ by one at most. The first is taken where several are equal.
+    The sizes of the parts differ by at most one. Of equal values the first is taken.
     """
     ends = [round(part * len(sharpness) / parts) for part in range(parts + 1)]
     return [max(range(a, b), key=lambda i: sharpness[i]) for a, b in pairwise(ends)]
@@ -182,7 +182,7 @@ def measure_sharpness(brightness: NDArray[np.uint8]) -> float:
 def _frames(file: Path) -> Iterator[_Frame]:
     """Decode the frames of the first video stream.
 
-    What can't be decoded ends the video with a warning where frames came before it.
+    Data that can't be decoded end the video with a warning; before the first frame, with an error.
     """
     import av
 
@@ -196,7 +196,7 @@ def _frames(file: Path) -> Iterator[_Frame]:
                 raise images.ImageError(f"{file}: it has no video")
             video = streams[0]
             video.thread_type = "AUTO"
-            # Asked before frames are decoded: some decoders forget what the container says.
+            # Read before frames are decoded: some decoders forget what the container says.
             codec, aspect = video.codec_context, video.sample_aspect_ratio or Fraction(1)
             encoding = colour.from_h273(codec.color_primaries, codec.color_trc)
             for frame in deinterlaced(container.decode(video)):
@@ -215,7 +215,7 @@ def _frames(file: Path) -> Iterator[_Frame]:
 
 
 def _square(width: int, height: int, aspect: Fraction) -> tuple[int, int]:
-    """Return the size at which pixels of an aspect (width / height) are square: never smaller."""
+    """Return the size with square pixels, never smaller; `aspect` is a pixel's width / height."""
     if aspect > 1:
         return round(width * aspect), height
     return width, round(height / aspect)
@@ -231,7 +231,7 @@ def _brightness(frame: VideoFrame) -> NDArray[np.uint8]:
 
 
 def _shown(frame: _Frame) -> images.ImageArray:
-    """Return a frame [H, W, 3] in 0..1: in sRGB, with square pixels, and turned."""
+    """Return a frame [H, W, 3] in 0..1: in sRGB, with square pixels, upright."""
     decoded = frame.decoded
     is_hd = decoded.colorspace == _UNKNOWN_MATRIX and decoded.height >= _HD_ROWS
     pixels = decoded.reformat(

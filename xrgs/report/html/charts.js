@@ -11,8 +11,8 @@ const RULES = {
 };
 const OVER = { step: "step", seconds: "seconds of training", evaluations: "alpha evaluations" };
 
-// A number with four digits, or with as many as tell it from others that are `step` away. Numbers up
-// to `most` have one unit.
+// A number as text: with four digits, or as many as a step between numbers needs. Numbers up to
+// `most` get the same unit.
 function brief(value, step, most = value) {
   if (value === 0) return "0";
   const [from, unit] = [[1e9, " G"], [1e6, " M"], [1e3, " k"]].find(([size]) => Math.abs(most) >= Math.max(size, 1e4)) ?? [1, ""];
@@ -112,7 +112,7 @@ function seriesFrom(rows, over, name) {
     .filter((one) => one.points.length);
 }
 
-// The series with the mean of each label that has several of one length, which are faint then.
+// Adds the mean of each label with several series of one length, and makes these series faint.
 function withMeans(series) {
   const means = distinct(series.map((one) => one.label)).flatMap((label) => {
     const runs = series.filter((one) => one.label === label);
@@ -131,7 +131,7 @@ function startCurves() {
   const known = Object.keys(RULES).filter((name) => data.history.some((row) => row[name]?.some((value) => value)));
   fill(rule, known.filter((name) => name !== "gaussians").map((name) => [name, RULES[name]]));
   const body = document.getElementById("curves-body");
-  // A short training measures nothing on its way.
+  // A short training has no evaluations on its way.
   const measured = data.scores.filter((score) => data.curves.some((row) => row[score.name]?.some((value) => value !== null)));
   over.parentElement.hidden = !measured.length;
   const draw = () => {
@@ -140,7 +140,7 @@ function startCurves() {
     charts.push(chart("Gaussians", withMeans(seriesFrom(data.history, "step", "gaussians")), OVER.step, "Gaussians"));
     if (rule.value) charts.push(chart(RULES[rule.value], withMeans(seriesFrom(data.history, "step", rule.value)), OVER.step, "so far"));
     body.replaceChildren(...charts);
-    const used = data.alone && labels.length < 2 ? [] : labels.filter((label) => passes({ label, scene: filters.scene }));
+    const used = data.single && labels.length < 2 ? [] : labels.filter((label) => passes({ label, scene: filters.scene }));
     document.getElementById("curves-legend").replaceChildren(...legend(used));
   };
   over.addEventListener("change", draw);

@@ -1,4 +1,4 @@
-"""What the page is made of: its answer, context and curves, and values of a store as JSON."""
+"""The content of the page: verdicts, context and curves, as plain values for JSON."""
 
 from __future__ import annotations
 
@@ -27,24 +27,24 @@ if TYPE_CHECKING:
     from xrgs.report.joined import ReportStore
     from xrgs.report.writing import Change
 
-#: What the cells have in common that the page shows side by side.
+#: The keys of a run. The page shows the cells of a run, one for each label, side by side.
 RUN = ["scene", "condition", "variant_seed", "seed"]
 
 
 @dataclass
 class Content:
-    """The parts of the page that its script shows: each list is of plain JSON values."""
+    """The parts of the page that its script shows, as lists of plain JSON values."""
 
     images: list[str] = field(default_factory=list)
-    """Data URLs; the other parts name an image by its place here."""
+    """Data URLs; the other parts name an image by its index in this list."""
     views: list[dict[str, Any]] = field(default_factory=list)
-    """Test views with their scores, and the images where there are any."""
+    """Test views with their scores, and images unless they were left out."""
     training: list[dict[str, Any]] = field(default_factory=list)
-    """Training views beside renders of them."""
+    """Training views with their renders."""
     curves: list[dict[str, Any]] = field(default_factory=list)
     """Quality during training of each cell."""
     history: list[dict[str, Any]] = field(default_factory=list)
-    """Gaussians during training of each cell, and what each rule grew and pruned."""
+    """Counts of each cell over its steps: Gaussians, and those grown and pruned by each rule."""
     trade_offs: list[dict[str, Any]] = field(default_factory=list)
     """Gaussians and scores of each label and scene."""
     models: list[dict[str, Any]] = field(default_factory=list)
@@ -52,11 +52,11 @@ class Content:
     cameras: list[dict[str, Any]] = field(default_factory=list)
     """The cameras of the models."""
     notes: list[str] = field(default_factory=list)
-    """What was left out, and why."""
-    alone: bool = False
-    """Whether there is nothing to compare: every cell is of one label."""
+    """Sentences on what was left out, and why."""
+    single: bool = False
+    """Whether all cells have one label, so that there is nothing to compare."""
     mixed: bool = True
-    """Whether photographs differ in resolution, so that HR and LR tell something."""
+    """Whether photographs differ in resolution, so that the page names HR and LR."""
 
 
 def shown(text: object) -> str:
@@ -65,7 +65,7 @@ def shown(text: object) -> str:
 
 
 def why(error: Exception, store: ReportStore) -> str:
-    """Return the message of an error, without the paths of the stores."""
+    """Return the message of an error, without the store's path."""
     return shown(store.without_paths(str(error)))
 
 
@@ -76,7 +76,7 @@ def finite(value: float) -> float | None:
 
 
 def run_names(row: Mapping[str, Any] | pd.Series) -> dict[str, str]:
-    """Return scene, condition and replicate of a row with the keys `RUN`, for the page."""
+    """Return the texts of scene, condition and replicate of a row with the keys `RUN`."""
     return {
         "scene": shown(row["scene"]),
         "condition": shown(row["condition"]),
@@ -102,7 +102,7 @@ def runs(comparison: Comparison) -> Iterator[pd.DataFrame]:
         yield groups[place]
 
 
-#: What a history counts, in the order of the page.
+#: Columns of a history that the page shows, in its order.
 RULES = (
     "gaussians",
     "duplicated",
@@ -114,7 +114,7 @@ RULES = (
     "pruned_by_components",
     "pruned_non_finite",
 )
-#: The most rows of a history that are drawn, evenly spaced: a plot has few more pixels.
+#: The most rows of a history that are drawn, evenly spaced; a plot has hardly more pixels.
 _MAX_ROWS = 240
 
 
@@ -133,7 +133,7 @@ def add_curves(content: Content, quality: pd.DataFrame) -> None:
 
 
 def add_history(content: Content, store: ReportStore, comparison: Comparison) -> None:
-    """Add Gaussians over steps, and what each rule grew and pruned, of each finished cell."""
+    """Add the counts over steps (`RULES`) of each finished cell."""
     for rows in runs(comparison):
         for _, row in rows[~rows["cell_id"].isin(store.external)].iterrows():
             try:
@@ -166,12 +166,12 @@ def add_trade_offs(content: Content, comparison: Comparison) -> None:
         content.trade_offs.append(texts | numbers)
 
 
-#: What the page of one label says first of each scene.
+#: The metrics that the page of one label shows first.
 _SUMMARY = ("psnr", "ssim", "lpips", "gaussians", "training_time_s")
 
 
 def summary(comparison: Comparison) -> list[tuple[str, list[tuple[str, str]]]]:
-    """Return the scores and counts that come first, by scene: means over its finished cells."""
+    """Return (scene, [(metric, value)]) for the metrics of `_SUMMARY`: means over done cells."""
     done = comparison.cells[comparison.cells["state"] == "done"]
     named = {metric.name: metric for metric in METRICS}
     metrics = [named[name] for name in _SUMMARY]
@@ -184,7 +184,7 @@ def summary(comparison: Comparison) -> list[tuple[str, list[tuple[str, str]]]]:
     ]
 
 
-#: Entries of the provenance that the context has.
+#: Entries of the provenance in the page's context -> their names there.
 _MADE_WITH = {
     "arithmetic": "Arithmetic",
     "xrgs": "xrgs",
@@ -194,23 +194,23 @@ _MADE_WITH = {
 
 @dataclass(frozen=True)
 class Answer:
-    """What one ablation changed."""
+    """The changes of one ablation, by their verdicts."""
 
     label: str
     condition: str
     pairs: str
-    """The numbers of scenes and pairs behind it, as a phrase."""
+    """The number of scenes and pairs, as a phrase."""
     better: tuple[str, ...]
-    """The outcomes that the tests show to be better, with their change."""
+    """The outcomes that are shown to be better, with their change."""
     worse: tuple[str, ...]
     undecided: tuple[tuple[str, tuple[str, ...]], ...]
-    """Other verdicts, each with its metrics and their changes."""
+    """Verdict -> the metrics with it and their changes, for all other verdicts."""
 
 
 def answers(comparison: Comparison) -> list[Answer]:
-    """Return what each ablation changed, in the order of the tables."""
+    """Return the verdicts on each ablation, in the order of the tables."""
     means = by_key(comparison.means)
-    found = []
+    result = []
     for label, condition in comparison.groups:
         rows = [
             (metric, means[label, condition, metric.name])
@@ -223,7 +223,7 @@ def answers(comparison: Comparison) -> list[Answer]:
         better, worse = (tuple(verdicts.pop(verdict, ())) for verdict in ("better", "worse"))
         scenes = max((row.scenes for _, row in rows), default=0)
         pairs = max((row.pairs for _, row in rows), default=0)
-        found.append(
+        result.append(
             Answer(
                 label=shown(label),
                 condition=shown(condition),
@@ -233,7 +233,7 @@ def answers(comparison: Comparison) -> list[Answer]:
                 undecided=tuple((why, tuple(texts)) for why, texts in verdicts.items()),
             )
         )
-    return found
+    return result
 
 
 def _change(metric: Metric, row: Change) -> str:
@@ -248,13 +248,13 @@ def page_context(
     contexts: Mapping[str, Context],
     variants: Mapping[str, Variant],
 ) -> list[tuple[str, str]]:
-    """Return names and values of the page's section on context.
+    """Return the rows (name, text) of the page's section on context.
 
     Args:
         sweep: The sweep.
         comparison: The comparison of its cells.
         contexts: How the cells of each condition were trained and scored.
-        variants: The variants of the cells that can be read, by their ids.
+        variants: The readable variants of the cells, by their ids.
     """
     cells = comparison.cells
     done = cells[cells["cell_id"].isin(sweep.done)].drop_duplicates("cell_id")
@@ -266,12 +266,12 @@ def page_context(
         ("Cells", f"{len(done)} of {planned} are done"),
     ]
     rows = of_many if planned > 1 else []
-    for condition, of in contexts.items():
-        rows.append((shown(titled("Training and scores", condition)), of.of_scores))
-        rows.append((shown(titled("Times", condition)), of.of_times))
+    for condition, context in contexts.items():
+        rows.append((shown(titled("Training and scores", condition)), context.of_scores))
+        rows.append((shown(titled("Times", condition)), context.of_times))
     rows += [(shown(scene), text) for scene, text in _views(sweep, done, variants)]
-    made = sweep.provenance
-    rows += [(name, _listed(made.get(key, ["n/a"]))) for key, name in _MADE_WITH.items()]
+    provenance = sweep.provenance
+    rows += [(name, _listed(provenance.get(key, ["n/a"]))) for key, name in _MADE_WITH.items()]
     return [(name, text) for name, text in rows if text]
 
 
@@ -280,7 +280,7 @@ def _replicates(rows: pd.DataFrame) -> list[str]:
 
 
 def _listed(values: Iterable[Any]) -> str:
-    """List distinct values in their order."""
+    """Join distinct values in their order by commas."""
     return shown(", ".join(dict.fromkeys(str(value) for value in values)))
 
 

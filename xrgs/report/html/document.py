@@ -1,7 +1,7 @@
 """Writes the page: a template, its style and scripts, and the content, in one file.
 
-The page needs nothing but itself. Its Content-Security-Policy forbids the network, and allows one
-script by its hash: a text from a store is text or JSON, and never markup or script.
+The page needs no other file. Its Content-Security-Policy forbids the network, and allows one script
+by its hash, so that a text from a store can never act as markup or script.
 """
 
 from __future__ import annotations
@@ -47,10 +47,10 @@ if TYPE_CHECKING:
     from xrgs.report.joined import ReportStore
     from xrgs.report.tables import Tables
 
-#: The largest page, in bytes, and what images and models may take of it.
+#: The largest page, bytes, and its parts for test views, training views and models.
 MAX_BYTES = 10_000_000
 _VIEW_BYTES, _TRAINING_BYTES, _MODEL_BYTES = 4_000_000, 1_500_000, 3_500_000
-#: The scripts, in the order that they need one another.
+#: The scripts in the order of loading; the first defines what the others use.
 _SCRIPTS = ("page.js", "tables.js", "views.js", "charts.js", "splats.js")
 
 
@@ -72,10 +72,10 @@ def write_document(
         store: The store with photographs, renders, histories and Gaussians.
         sweep: The sweep.
         tables: Builds the tables of the sweep's comparison.
-        texts: Every table of the report, in order.
+        texts: All tables of the report, in order.
         quality: Quality during training, as `xrgs.report.curves.joined` returns it.
-        warnings: Sentences that a reader has to know.
-        pictures: Whether to have photographs, renders and models.
+        warnings: Sentences for the top of the page.
+        pictures: Whether the page has photographs, renders and models.
 
     Raises:
         OSError: The file can't be written.
@@ -90,47 +90,47 @@ def write_document(
         add_trained(content, store, comparison, variants, _TRAINING_BYTES, _MODEL_BYTES)
     else:
         content.notes.append("Photographs, renders and models were left out: --pictures none.")
-    alone = not comparison.groups
+    single = not comparison.groups
     named = listed(comparison.scenes)
     head = {
         "id": shown(sweep.id),
-        "alone": alone,
-        "title": shown(named if alone else f"Change from {comparison.base}"),
+        "single": single,
+        "title": shown(named if single else f"Change from {comparison.base}"),
         "summary": summary(comparison),
         "commands": [shown(" ".join(("xrgs-sweep", *words))) for words in sweep.commands.values()],
         "base": shown(comparison.base),
         "answers": answers(comparison),
         "context": page_context(sweep, comparison, tables.contexts, variants),
-        "photographs": _photographs(sweep, alone=alone),
+        "photographs": _photographs(sweep, single=single),
         "warnings": [shown(text) for text in (*warnings, *tables.cautions)],
     }
-    content.alone = alone
+    content.single = single
     content.mixed = not all(report.alike for report in sweep.variants.values())
     write_text(file, _fitting(head, content, tables, [table for table in texts if table.rows]))
 
 
-def _photographs(sweep: Sweep, *, alone: bool) -> list[tuple[str, list[str]]]:
-    """Return what became of each scene's photographs; of one label, how they were placed first."""
-    found = dict(photographs(sweep))
-    if alone:
+def _photographs(sweep: Sweep, *, single: bool) -> list[tuple[str, list[str]]]:
+    """Return (scene, notes on its photographs); if `single`, the placement is the first note."""
+    by_scene = dict(photographs(sweep))
+    if single:
         done = sweep.cells.loc[sweep.cells["state"] == "done", "scene"].unique()
-        found = {scene: (placement(sweep, scene), *found.get(scene, ())) for scene in done}
-    return [(shown(scene), [*map(for_line, notes)]) for scene, notes in found.items()]
+        by_scene = {scene: (placement(sweep, scene), *by_scene.get(scene, ())) for scene in done}
+    return [(shown(scene), [*map(for_line, notes)]) for scene, notes in by_scene.items()]
 
 
 def _variants(store: ReportStore, cells: pd.DataFrame, content: Content) -> dict[str, Variant]:
     """Load the variants of the finished cells; note those that can't be read."""
-    found = {}
+    variants = {}
     for name in cells.loc[cells["state"] == "done", "variant_id"].unique():
         try:
-            found[name] = variant.load(store.variant(name))
+            variants[name] = variant.load(store.variant(name))
         except XrgsError as error:
             content.notes.append(f"Variant {shown(name)}: {why(error, store)}")
-    return found
+    return variants
 
 
 def _fitting(head: dict[str, Any], content: Content, tables: Tables, texts: list[TextTable]) -> str:
-    """Return the page; where it would be larger than `MAX_BYTES`, parts are left out."""
+    """Return the page; parts are left out until it has at most `MAX_BYTES`."""
     long = tables.long()
     for part in ("history", "models", "curves", ""):
         text = _rendered(head, content, tables, texts, long)
@@ -183,7 +183,7 @@ def _rendered(
 
 
 def _printable(table: TextTable) -> TextTable:
-    """Return a table with its texts as printable lines of bounded length, the notes long ones."""
+    """Make all texts of a table printable lines; those of its cells are cut to a length."""
     notes = (table.context, *table.notes) if table.context else table.notes
     return TextTable(
         shown(table.title),
@@ -196,12 +196,12 @@ def _printable(table: TextTable) -> TextTable:
 
 
 def _source(name: str) -> str:
-    """Return a file of the package, in which no `</` ends the page's element around it."""
+    """Read a style or script of the package; it must not have `</`, which ends its element."""
     return resources.files("xrgs.report.html").joinpath(name).read_text(encoding="utf-8")
 
 
 def _policy(style: str, script: str) -> str:
-    """Return the Content-Security-Policy: this style and script, images that are in the page."""
+    """Return the Content-Security-Policy: only this style and script, and images in data URLs."""
 
     def hashed(text: str) -> str:
         digest = hashlib.sha256(text.encode()).digest()
@@ -214,7 +214,7 @@ def _policy(style: str, script: str) -> str:
 
 
 def _is_measured(content: Content, name: str) -> bool:
-    """Return whether any view has a score; LPIPS needs weights that a machine may lack."""
+    """Return whether any view has a score; LPIPS is missing without its weights."""
     arms = (arm for entry in content.views for arm in entry["arms"])
     return any(arm["scores"][name] is not None for arm in arms)
 
@@ -226,29 +226,28 @@ def _score(name: str) -> dict[str, Any]:
 
 
 def _copies(table: TextTable) -> dict[str, str]:
-    """Return a table in the forms that it can be copied in."""
+    """Return a table in the formats of the copy buttons."""
     rows = [[for_csv(text) for text in row] for row in table.rows]
     columns = [for_csv(name) for name in table.columns]
     csv = pd.DataFrame(rows, columns=columns).to_csv(index=False, lineterminator="\n")
     return {"latex": to_latex(table), "markdown": to_markdown(table), "csv": str(csv)}
 
 
-#: The number of lines before the first row of a table, in each form.
+#: Format of a copy button -> the number of lines before a table's first row.
 _HEAD_LINES = {"latex": 9, "markdown": 4, "csv": 1}
 
 
 def _lines(table: TextTable) -> dict[str, dict[str, list[str]]]:
-    """Return a table in the same forms, by lines, so that the page can copy some of the rows."""
-    found = {}
+    """Return a table in the same formats, as lines, so that the page can copy some rows."""
+    by_format = {}
     for form, text in _copies(table).items():
         lines, first = text.split("\n"), _HEAD_LINES[form]
         last = first + len(table.rows)
-        found[form] = {"head": lines[:first], "rows": lines[first:last], "foot": lines[last:]}
-    return found
+        by_format[form] = {"head": lines[:first], "rows": lines[first:last], "foot": lines[last:]}
+    return by_format
 
 
-#: The columns of the table of all changes, and their alignment; `{base}` stands for the base's
-#: label.
+#: Columns of the table of all changes -> their alignment; `{base}` is the base's label.
 _CHANGE_COLUMNS = {
     "Ablation": "l", "Scene": "l", "Metric": "l", "Change": "r", "Verdict": "l", "{base}": "r",
     "Value": "r", "From": "r", "To": "r", "q": "r", "Same sign": "l",
@@ -256,7 +255,7 @@ _CHANGE_COLUMNS = {
 
 
 def _changes_table(rows: Sequence[dict[str, Any]], base: str) -> TextTable:
-    """Return the table of all changes, with the texts of `_changes`."""
+    """Return the table of all changes, from the rows of `_changes`."""
     columns = tuple(name.format(base=base) for name in _CHANGE_COLUMNS)
     texts = tuple(map(_texts, rows))
     return TextTable(f"Changes from {base}", columns, texts, "".join(_CHANGE_COLUMNS.values()))
@@ -271,7 +270,7 @@ def _changes(long: pd.DataFrame, scenes: Sequence[str]) -> Iterator[dict[str, An
 
     Args:
         long: The table `Tables.long`.
-        scenes: The scenes; of one, its rows would say what the means say, which stand for them.
+        scenes: The scenes. A single scene has no rows, since the means' rows have its values.
     """
     metrics = {metric.name: metric for metric in METRICS}
     only = scenes[0] if len(scenes) == 1 else ""

@@ -1,6 +1,6 @@
 """The pictures of the page: test views and training views as WebP, error maps, and models for 3D.
 
-Images are kept in data URLs, within a number of bytes.
+Images become data URLs, up to a total number of bytes.
 """
 
 from __future__ import annotations
@@ -36,28 +36,27 @@ if TYPE_CHECKING:
     from xrgs.report.joined import ReportStore
     from xrgs.viewer.trained import TrainedScene, TrainingView
 
-#: The longer side that an image of the page has at most, px.
+#: The largest longer side of an image on the page, px.
 _MAX_SIDE = 1008
-#: The mean absolute difference of the channels, in 0..1, from which an error map is brightest.
+#: The mean absolute difference of the channels, 0..1, at and above which an error map is brightest.
 ERROR_RANGE = 0.25
 #: Error maps are shrunk by this factor: they show where a render is wrong, not each pixel.
 _ERROR_SHRINK = 2
-#: Quality of WebP, and the bytes that a pixel of a photograph takes with it at most, best first.
+#: Quality of WebP, and the most bytes that a pixel of a photograph takes with it; best first.
 _QUALITIES = ((90, 0.40), (80, 0.22), (60, 0.13), (40, 0.09))
 
 
-#: The largest image that is read.
+#: The largest image that is read, px.
 _MAX_PIXELS = 1 << 24
-#: Scores by cell and view.
+#: (cell's id, view) -> scores by name.
 _Scores = dict[tuple[str, str], dict[str, float | None]]
-#: The pixels of photographs and renders, times this, are about those of error maps as well.
+#: The approximate ratio of all pixels, with error maps, to those of photographs and renders.
 _WITH_ERROR_MAPS = 1.25
 
 
 #: The most runs with training views and models.
 _MAX_RUNS = 12
-#: The most Gaussians of a model, which a weak graphics processor can still sort and draw, and the
-#: fewest with which one can be recognised.
+#: The most Gaussians of a model, for weak graphics processors, and the fewest that show a scene.
 _MAX_KEPT, _MIN_KEPT = 100_000, 8_000
 
 
@@ -65,9 +64,9 @@ class Album:
     """Adds images to those of a page, each image once.
 
     Args:
-        urls: The images of the page, as data URLs.
-        max_bytes: The most bytes that the data URLs which are added may take together.
-        pixels: About how many pixels will be added in all, which decides the quality.
+        urls: The images of the page, as data URLs; new ones are appended.
+        max_bytes: The most bytes of all added data URLs.
+        pixels: The expected number of added pixels, which decides the quality.
     """
 
     def __init__(self, urls: list[str], max_bytes: int, pixels: int) -> None:
@@ -81,7 +80,7 @@ class Album:
         """Add RGB images that belong together.
 
         Returns:
-            The place of each in the page's images. Where they do not fit, none is added, and the
+            The index of each in the page's images. If they do not fit, none is added, and the
             result is None.
         """
         urls = [data_url(image, self._quality) for image in images]
@@ -97,7 +96,7 @@ class Album:
 
 
 def data_url(image: Image.Image, quality: int) -> str:
-    """Encode an RGB image as WebP in a data URL; a side of more than 1008 px is shrunk to that.
+    """Encode an RGB image as WebP in a data URL; its longer side is shrunk to `_MAX_SIDE` at most.
 
     `quality` is on libwebp's scale, 1 to 100.
     """
@@ -115,11 +114,11 @@ def to_image(array: NDArray[np.float32]) -> Image.Image:
 
 
 def error_map(photograph: Image.Image, render: Image.Image) -> Image.Image:
-    """Draw where a render differs from its photograph.
+    """Draw the difference of a render from its photograph.
 
     Args:
         photograph: An image of mode RGB.
-        render: An image of the same size.
+        render: An image of mode RGB and the same size.
 
     Returns:
         The mean absolute difference of the channels, from black at 0 to pale yellow at
@@ -144,10 +143,10 @@ def add_views(
     views: pd.DataFrame,
     max_bytes: int,
 ) -> None:
-    """Add every scored view of every cell, with as many images as fit into `max_bytes`.
+    """Add all scored views of all cells, with images until `max_bytes` are used.
 
     The first replicates of all scenes come first, each with its worst view first. A view whose
-    images do not fit has its scores alone, and the notes count such views.
+    images do not fit has only its scores, and a note counts such views.
     """
     scores: _Scores = {
         (row["cell_id"], row["view"]): {name: finite(row[name]) for name in VIEW_METRICS}
@@ -165,8 +164,8 @@ def add_views(
     for cells, view, entry in progress(wanted, "encoding views", "view"):
         content.views.append(entry)
         if max_bytes:
-            found = _read(content, store, cells, view, _title(entry))
-            left_out += found is not None and not _add_images(entry, found, album)
+            pictures = _read(content, store, cells, view, _title(entry))
+            left_out += pictures is not None and not _add_images(entry, pictures, album)
             if "size" in entry:
                 entry["hidden"] = _hidden(_photograph(store, cells, view), tuple(entry["size"]))
     if left_out:
@@ -181,14 +180,14 @@ def _title(entry: dict[str, Any]) -> str:
 
 
 def _photograph(store: ReportStore, cells: pd.DataFrame, view: str) -> Path:
-    """Return the file of the photograph of a view that cells are scored on."""
+    """Return the file of a scored view's photograph; all cells of a run have one variant."""
     first = cells.iloc[0]
     split = "train" if first["validation"] > 0 else "test"
     return store.variant(first["variant_id"]) / "images" / split / f"{view}.png"
 
 
 def _pixels(store: ReportStore, cells: pd.DataFrame, view: str) -> int:
-    """Return the number of pixels of a view's images, 0 where its photograph can't be read."""
+    """Return the number of pixels of a view's images; 0 if its photograph can't be read."""
     try:
         width, height = images.size(_photograph(store, cells, view))
     except (UnreadableError, ImageError):
@@ -197,7 +196,7 @@ def _pixels(store: ReportStore, cells: pd.DataFrame, view: str) -> int:
 
 
 def _hidden(photograph: Path, size: tuple[int, int]) -> float:
-    """Return the share of a photograph's pixels that its mask hides; 0 where it has none."""
+    """Return the share of a photograph's pixels that its mask hides; 0 if it has no mask."""
     file = photograph.parent.with_name(f"{photograph.parent.name}-masks") / photograph.name
     try:
         return float(1 - images.read_mask(file, size).mean())
@@ -208,8 +207,8 @@ def _hidden(photograph: Path, size: tuple[int, int]) -> float:
 def _entries(
     cells: pd.DataFrame, names: dict[str, list[str]], scores: _Scores
 ) -> list[tuple[str, dict[str, Any]]]:
-    """Return the views of the cells of a run with their entries, the least mean PSNR first."""
-    found = []
+    """Return (view, its entry on the page) for the cells of a run, the lowest mean PSNR first."""
+    entries = []
     for view in dict.fromkeys(v for name in cells["cell_id"] for v in names.get(name, ())):
         arms: list[dict[str, Any]] = [
             {"label": shown(label), "scores": scores.get((cell, view), dict.fromkeys(VIEW_METRICS))}
@@ -218,19 +217,19 @@ def _entries(
         psnr = [arm["scores"]["psnr"] for arm in arms if arm["scores"]["psnr"] is not None]
         names_of = run_names(cells.iloc[0]) | {"view": shown(view)}
         entry = names_of | {"arms": arms, "psnr": finite(fmean(psnr)) if psnr else None}
-        found.append((view, entry))
-    return sorted(found, key=lambda one: math.inf if one[1]["psnr"] is None else one[1]["psnr"])
+        entries.append((view, entry))
+    return sorted(entries, key=lambda one: math.inf if one[1]["psnr"] is None else one[1]["psnr"])
 
 
 def _read(
     content: Content, store: ReportStore, cells: pd.DataFrame, view: str, title: str
 ) -> tuple[Image.Image, dict[int, Image.Image]] | None:
-    """Read a view's photograph, and its renders by the place of their cell.
+    """Read a view's photograph, and its renders by the index of their cell.
 
-    A render that can't be read, or has another size than the photograph, is left out and noted;
-    None without a photograph.
+    A render that can't be read, or has another size than the photograph, is left out and noted. The
+    result is None if the photograph can't be read.
     """
-    found: dict[int, Image.Image] = {}
+    renders: dict[int, Image.Image] = {}
     try:
         truth = images.read_png_pil(_photograph(store, cells, view), max_pixels=_MAX_PIXELS)
     except (UnreadableError, ImageError) as error:
@@ -239,20 +238,20 @@ def _read(
     for place, cell_id in enumerate(cells["cell_id"]):
         try:
             file = store.render(cell_id, view)
-            found[place] = images.read_png_pil(file, truth.size, _MAX_PIXELS)
+            renders[place] = images.read_png_pil(file, truth.size, _MAX_PIXELS)
         except (StoreError, ImageError) as error:
             label = shown(cells["label"].iloc[place])
             content.notes.append(f"{title}: no render of {label}, {why(error, store)}")
-    return truth, found
+    return truth, renders
 
 
 def _add_images(
     entry: dict[str, Any],
-    found: tuple[Image.Image, dict[int, Image.Image]],
+    pictures: tuple[Image.Image, dict[int, Image.Image]],
     album: Album,
 ) -> bool:
     """Add a view's images to its entry and to the album; return whether they fit."""
-    photograph, renders = found
+    photograph, renders = pictures
     errors = [error_map(photograph, render) for render in renders.values()]
     places = album.add([photograph, *renders.values(), *errors])
     if places is None:
@@ -273,17 +272,17 @@ def add_trained(
     max_image_bytes: int,
     max_model_bytes: int,
 ) -> None:
-    """Add training views with renders of them, models for 3D, and the cameras.
+    """Add training views with their renders, models for 3D, and the cameras.
 
-    They are of the first replicate of each scene and condition, where its variant can be read.
+    They come from the first replicate of each scene and condition whose variant can be read.
 
     Args:
         content: The content of the page.
         store: The store with the cells.
         comparison: The comparison of the cells.
-        variants: The variants that can be read, by their ids.
-        max_image_bytes: The most bytes that the images may take.
-        max_model_bytes: The most bytes that the models may take as base64.
+        variants: The readable variants, by their ids.
+        max_image_bytes: The most bytes of the images.
+        max_model_bytes: The most bytes of the models as base64.
     """
     first: dict[tuple[str, str], pd.DataFrame] = {}
     for rows in runs(comparison):
@@ -331,7 +330,7 @@ def add_trained(
 def _load_models(
     content: Content, store: ReportStore, rows: pd.DataFrame, scene: TrainedScene
 ) -> dict[str, str]:
-    """Load the Gaussians of the cells of a run; return the labels of those that can be read."""
+    """Load the Gaussians of the cells of a run; return {cell's id: label} for the readable ones."""
     labels: dict[str, str] = {}
     for cell_id, label in zip(rows["cell_id"], map(shown, rows["label"]), strict=True):
         if cell_id in store.external:
@@ -376,6 +375,6 @@ def _add_training_views(
 
 
 def _images_of(view: TrainingView) -> list[NDArray[np.float32]]:
-    """Return photograph, original where there is one, and renders."""
+    """Return the photograph, the original if there is one, and the renders."""
     before = [] if view.original is None else [view.original]
     return [view.photograph, *before, *view.renders.values()]

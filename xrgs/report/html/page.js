@@ -1,23 +1,23 @@
 "use strict";
-// Shared helpers, the filters, and the links of the paper's figures. Text from the data is only ever
-// set as text: nothing here makes markup of it.
+// Shared helpers, the filters, and the links of the paper's figures. Text from the data is only set
+// as text, never as markup.
 const data = JSON.parse(document.getElementById("data").textContent);
 const SVG = "http://www.w3.org/2000/svg";
 const filters = { scene: "", label: "", metric: "" };
 const onFilter = [];
 
 function element(name, attributes = {}, ...children) {
-  const made = document.createElement(name);
-  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
-  made.append(...children);
-  return made;
+  const node = document.createElement(name);
+  for (const [key, value] of Object.entries(attributes)) node.setAttribute(key, value);
+  node.append(...children);
+  return node;
 }
 
 function svg(name, attributes = {}, ...children) {
-  const made = document.createElementNS(SVG, name);
-  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
-  made.append(...children);
-  return made;
+  const node = document.createElementNS(SVG, name);
+  for (const [key, value] of Object.entries(attributes)) node.setAttribute(key, value);
+  node.append(...children);
+  return node;
 }
 
 function distinct(values) {
@@ -26,16 +26,16 @@ function distinct(values) {
 
 function fill(select, options, chosen) {
   select.replaceChildren(...options.map(([value, text]) => element("option", { value }, text)));
-  if (data.alone && select.parentElement?.tagName === "LABEL") select.parentElement.hidden = options.length < 2;
+  if (data.single && select.parentElement?.tagName === "LABEL") select.parentElement.hidden = options.length < 2;
   if (chosen !== undefined) select.value = chosen;
 }
 
-// The name of a trained arm: on the page of one label there is no other.
+// The name of an arm; the page of a single label calls it `render`.
 function armName(label) {
-  return data.alone ? "render" : label;
+  return data.single ? "render" : label;
 }
 
-// HR, LR or test; where photographs are alike, training or test.
+// HR, LR or test; if photographs have one resolution, training or test.
 function kindName(kind) {
   return data.mixed || kind === "test" ? kind : "training";
 }
@@ -44,7 +44,7 @@ function labelled(text, select) {
   return element("label", {}, text, select);
 }
 
-// The names of a run: scene, then condition and replicate where there are several.
+// The name of a run: scene, condition, and replicate if there are several.
 function runName(run) {
   const replicate = several("replicate") ? `replicate ${run.replicate}` : "";
   return [run.scene, run.condition, replicate].filter(Boolean).join(", ");
@@ -104,12 +104,12 @@ function startFigures(sections) {
 }
 
 document.addEventListener("DOMContentLoaded", () => {
-  if (!data.alone) startFilters();
+  if (!data.single) startFilters();
   startTables();
   const sections = { views: startViews(), training: startTraining() };
   startScores(sections.views);
   if (document.getElementById("curves")) startCurves();
-  if (!data.alone) startTradeOffs();
+  if (!data.single) startTradeOffs();
   startSplats();
   startFigures(sections);
 });

@@ -1,6 +1,6 @@
-// Two trained scenes side by side under one camera: Gaussians are projected, sorted and blended as
-// xrgs.splat does (EWA splatting), with WebGL2. OpenCV axes: x right, y down, z forward. viser's page
-// shows one scene with a camera of its own, and needs a policy that lets any script run.
+// Two trained scenes side by side under one camera: Gaussians are projected, sorted and blended by
+// WebGL2 as in xrgs.splat (EWA splatting). OpenCV axes: x right, y down, z forward. viser can't do
+// this: its page shows one scene, and needs a policy that lets any script run.
 const GAUSSIAN_SHADER = `#version 300 es
 precision highp float;
 uniform highp sampler2D gaussians;
@@ -24,7 +24,7 @@ void main() {
   vec3 t = (view * vec4(mean.xyz, 1.0)).xyz;
   if (t.z < 0.01) return;
   mat3 covariance = mat3(first.x, first.y, first.z, first.y, first.w, second.x, first.z, second.x, second.y);
-  // As in gsplat, the slope at which the projection is linearised is bounded.
+  // As in gsplat, the slope at which the projection is linearised is clamped.
   vec2 low = -center / focal - 0.15 * size / focal, high = (size - center) / focal + 0.15 * size / focal;
   vec2 slope = clamp(t.xy / t.z, low, high);
   mat3 jacobian = mat3(focal.x / t.z, 0, 0, 0, focal.y / t.z, 0, -focal.x * slope.x / t.z, -focal.y * slope.y / t.z, 0);
@@ -71,11 +71,11 @@ in vec3 shade;
 out vec4 result;
 void main() { result = vec4(shade, 1.0); }`;
 const TINTS = { HR: [1, 0.62, 0.25], LR: [0.34, 0.71, 0.91], test: [0.95, 0.95, 0.95] };
-const FRUSTUM = 0.06; // of the distance between the cameras and what they look at
+const FRUSTUM = 0.06; // depth of a drawn camera, over its distance from the origin
 const WIDTH = 720; // of a canvas, px
-const TEXTURE = 2048; // its width, texels; a Gaussian has four
+const TEXTURE = 2048; // width of the texture, texels; a Gaussian takes four
 
-// Undoes `quantise` of xrgs/viewer/trained.py, and forms the covariances.
+// Undoes `quantise` of xrgs/viewer/trained.py, and computes the covariances.
 function decode(model) {
   const bytes = Uint8Array.from(atob(model.data), (char) => char.charCodeAt(0));
   const numbers = new DataView(bytes.buffer);
@@ -98,7 +98,7 @@ function decode(model) {
   return { texels, rows: Math.max(1, rows), means, order: new Uint32Array(model.count) };
 }
 
-// R S S^T R^T of a quaternion (w, x, y, z): xx, xy, xz, yy, yz, zz.
+// The covariance R S S^T R^T of scales and a quaternion (w, x, y, z): xx, xy, xz, yy, yz, zz.
 function covariance(scales, quaternion) {
   const norm = Math.hypot(...quaternion) || 1;
   const [w, x, y, z] = quaternion.map((value) => value / norm);
@@ -111,7 +111,7 @@ function covariance(scales, quaternion) {
   return [entry(0, 0), entry(0, 1), entry(0, 2), entry(1, 1), entry(1, 2), entry(2, 2)];
 }
 
-// Sorts Gaussians from far to near by counting, since blending is in that order.
+// Sorts Gaussians from far to near, the order of blending, by a counting sort.
 function sortByDepth({ means, order }, view) {
   const count = order.length;
   const depths = new Float32Array(count);
@@ -119,7 +119,7 @@ function sortByDepth({ means, order }, view) {
   let most = -Infinity;
   for (let i = 0; i < count; i++) {
     const depth = view[8] * means[3 * i] + view[9] * means[3 * i + 1] + view[10] * means[3 * i + 2] + view[11];
-    // By the reciprocal, so that what is near is told apart as finely as it is seen.
+    // By reciprocal depth, which sorts near Gaussians more finely.
     depths[i] = 1 / Math.max(depth, 0.01);
     least = Math.min(least, depths[i]);
     most = Math.max(most, depths[i]);
@@ -163,7 +163,7 @@ class Panel {
     for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, side, gl.NEAREST);
   }
 
-  // A program with a buffer for each attribute: its name, numbers, and instances that share one.
+  // Makes a program with a buffer for each attribute [name, numbers per vertex, divisor].
   setUp(vertex, fragment, attributes) {
     const { gl } = this;
     const made = { program: program(gl, vertex, fragment), array: gl.createVertexArray() };
@@ -223,7 +223,7 @@ class Panel {
       return at;
     };
     const at = use(this.gaussians);
-    // The dilation is in px of the photographs.
+    // eps2d is in px^2 of the photographs.
     gl.uniform1f(at("eps2d"), this.model.eps2d * scale * scale);
     gl.uniform1i(at("compensate"), this.model.antialiased ? 1 : 0);
     gl.bindBuffer(gl.ARRAY_BUFFER, this.gaussians.index);
@@ -250,7 +250,7 @@ function cameraPosition(V) {
   return [0, 1, 2].map((i) => -(V[i] * V[3] + V[4 + i] * V[7] + V[8 + i] * V[11]));
 }
 
-// Turns a view by two angles (radians) around the point at `distance` before the camera.
+// Turns a view by two angles (radians) around the point at `distance` in front of the camera.
 function orbited(V, right, down, distance) {
   const [c, s, d, e] = [Math.cos(right), Math.sin(right), Math.cos(down), Math.sin(down)];
   const M = [c, 0, s, e * s, d, -e * c, -d * s, e, d * c];
@@ -269,8 +269,8 @@ class Splats {
     this.keys = distinct(data.models.map(runName));
     this.scene = element("select");
     this.look = element("select");
-    // Two models side by side, or the only one.
-    const places = data.alone ? [0] : [0, 1];
+    // Two models side by side, or a single one.
+    const places = data.single ? [0] : [0, 1];
     this.sides = places.map(() => element("select"));
     this.frusta = element("input", { type: "checkbox", checked: "" });
     const nearer = element("button", { type: "button" }, "Nearer");
@@ -280,8 +280,8 @@ class Splats {
     this.captions = places.map(() => element("figcaption"));
     const canvases = places.map(() => element("canvas", { tabindex: "0", role: "img" }));
     const figures = canvases.map((canvas, place) => element("figure", {}, canvas, this.captions[place]));
-    const note = element("p", { class: "note" }, `Drag or press the arrow keys to turn ${data.alone ? "it, with Shift to shift it" : "both, with Shift to shift them"}; + and - or the wheel over a focused picture go nearer and farther. These are not the renders that are scored: only the Gaussians that show most in training views are kept, quantised to 8 and 16 bits, with their mean colour for all directions.`);
-    body.append(controls, element("div", { class: "legend" }, ...swatches), element("div", { class: data.alone ? "pair single" : "pair" }, ...figures), note);
+    const note = element("p", { class: "note" }, `Drag or press the arrow keys to turn ${data.single ? "it, with Shift to shift it" : "both, with Shift to shift them"}; + and - or the wheel over a focused picture go nearer and farther. These are not the renders that are scored: only the Gaussians that show most in training views are kept, quantised to 8 and 16 bits, with their mean colour for all directions.`);
+    body.append(controls, element("div", { class: "legend" }, ...swatches), element("div", { class: data.single ? "pair single" : "pair" }, ...figures), note);
     this.panels = canvases.map((canvas) => new Panel(canvas));
     fill(this.scene, this.keys.map((key) => [key, key]));
     this.scene.addEventListener("change", () => this.choose());
@@ -324,7 +324,7 @@ class Splats {
       const model = this.models[Number(this.sides[side].value)];
       panel.load(model, this.cameras);
       const kept = `${model.count.toLocaleString("en")} of ${model.total.toLocaleString("en")} Gaussians, ${(100 * model.share).toFixed(1)} % of the blending weight`;
-      this.captions[side].replaceChildren(...(data.alone ? [] : [element("b", {}, model.label), " "]), kept);
+      this.captions[side].replaceChildren(...(data.single ? [] : [element("b", {}, model.label), " "]), kept);
       panel.canvas.setAttribute("aria-label", `3D view of ${model.label}: ${this.scene.value}. ${kept}. Arrow keys turn it.`);
     });
     if (this.camera) this.draw();
@@ -351,7 +351,7 @@ class Splats {
     this.draw();
   }
 
-  // Shifts the scene by shares of the distance, and changes the distance by a factor.
+  // Shifts the scene by fractions of the distance, and multiplies the distance by a factor.
   move(right, down, factor) {
     const view = [...this.camera.view];
     view[3] += right * this.distance;
@@ -389,7 +389,7 @@ class Splats {
   }
 }
 
-// Started when it comes into sight, since a graphics processor may be busy for a moment.
+// Starts when the section is scrolled into sight, since it keeps the graphics processor busy.
 function startSplats() {
   const body = document.getElementById("splats-body");
   if (!body) return;

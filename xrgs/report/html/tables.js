@@ -12,7 +12,7 @@ function compareKeys(first, second) {
   return String(first).localeCompare(String(second), undefined, { numeric: true });
 }
 
-// What is missing stays at the end, whichever way the others are sorted.
+// Sorts the rows of a table by a column; missing values stay at the end in both directions.
 function sortBy(table, column, descending) {
   const rows = [...table.tBodies[0].rows].map((row, place) => ({ row, place, key: sortKey(row.cells[column]) }));
   rows.sort((a, b) => {
@@ -46,7 +46,7 @@ function filterChanges() {
   }
 }
 
-// The rows of the table of changes that are shown, in their order, in one of three forms.
+// The shown rows of the table of changes, in their order, in one of three formats.
 function writtenChanges(form) {
   const { head, rows, foot } = data.changes[form];
   const shown = [...document.querySelectorAll("#changes-table tbody tr:not([hidden])")];
@@ -59,7 +59,7 @@ async function copy(text, button) {
     await navigator.clipboard.writeText(text);
     button.textContent = "Copied";
   } catch {
-    // A page from a file may not write the clipboard: the text is shown, selected, to be copied.
+    // Pages from a file may not write the clipboard: show the text, selected, for Ctrl+C.
     const area = element("textarea", { rows: "8", cols: "60", "aria-label": "Text to copy" });
     area.value = text;
     button.parentElement.querySelector("textarea")?.remove();

@@ -1,12 +1,12 @@
-// Pictures: a large one with a slider between any two, tiles of all, and a loupe in all at once.
+// Pictures of a view: a large one with a slider between any two, tiles of all, a loupe on all.
 const LOUPE = { side: 120, zoom: 4, step: 0.02 };
 
 function picture(place, alt) {
   return element("img", { src: data.images[place], alt, decoding: "async" });
 }
 
-// Shows one entry after another of a list of views. `pictures` gives those of an entry, as
-// { name, caption, image, alt }; the first two are compared at first.
+// Shows one view (entry) of a list. `pictures(entry)` returns its pictures, as
+// { name, caption, image, alt }; at first the first and the last are compared.
 class Viewer {
   constructor(body, entries, pictures, name) {
     Object.assign(this, { entries, pictures, name, at: { x: 0.5, y: 0.5 }, loupes: [] });
@@ -128,7 +128,7 @@ class Viewer {
     for (const loupe of this.loupes) this.magnify(loupe);
   }
 
-  // On the large picture the loupe shows the side of the slider that it is on.
+  // On the large picture the loupe shows the picture under it, left or right of the slider.
   magnify(loupe) {
     const { frame } = loupe;
     loupe.canvas ??= element("canvas", { width: LOUPE.side, height: LOUPE.side, "aria-hidden": "true" });
@@ -137,7 +137,7 @@ class Viewer {
     loupe.canvas.style.top = `${this.at.y * 100}%`;
     const onRight = frame === this.stage && this.at.x * 100 > Number(this.slider.value);
     const image = onRight ? this.over : loupe.image;
-    // All loupes show the same part of the scene, whatever the picture's own size.
+    // All loupes show the same part of the scene, whatever the size of the picture.
     const part = LOUPE.side / LOUPE.zoom / Math.max(1, this.entrySize()[0]);
     const width = part * image.naturalWidth;
     const height = width;
@@ -168,7 +168,7 @@ function testPictures(entry) {
   return [
     { name: "photograph", caption: `${entry.size[0]} × ${entry.size[1]} px${hidden}`, image: entry.photograph, alt: `Photograph: ${at}` },
     ...arms.map((arm) => ({ name: armName(arm.label), label: arm.label, caption: scoresText(arm.scores), image: arm.image, alt: `Render by ${arm.label}: ${at}. ${scoresText(arm.scores)}` })),
-    ...arms.map((arm) => ({ name: data.alone ? "error" : `error of ${arm.label}`, caption: "", image: arm.error, apart: true, alt: `Error map of ${arm.label}: ${at}` })),
+    ...arms.map((arm) => ({ name: data.single ? "error" : `error of ${arm.label}`, caption: "", image: arm.error, apart: true, alt: `Error map of ${arm.label}: ${at}` })),
   ];
 }
 
@@ -177,7 +177,7 @@ function trainingPictures(entry) {
   const size = `${entry.size[0]} × ${entry.size[1]} px`;
   const found = [{ name: data.mixed ? `${entry.tag} photograph` : "photograph", caption: `as trained on, ${size}`, image: entry.photograph, coarse: data.mixed && entry.tag === "LR", alt: `${kindName(entry.tag)} photograph, ${size}: ${at}` }];
   if (entry.original !== null) found.push({ name: "original", caption: "before it was degraded; only all_hr trains on it", image: entry.original, alt: `The photograph before it was degraded: ${at}` });
-  return [...found, ...entry.arms.map((arm) => ({ name: armName(arm.label), label: arm.label, caption: data.alone ? "" : "render", image: arm.image, alt: `Render by ${arm.label}: ${at}` }))];
+  return [...found, ...entry.arms.map((arm) => ({ name: armName(arm.label), label: arm.label, caption: data.single ? "" : "render", image: arm.image, alt: `Render by ${arm.label}: ${at}` }))];
 }
 
 function startViewer(id, entries, pictures, name, missing) {
@@ -188,7 +188,7 @@ function startViewer(id, entries, pictures, name, missing) {
   return { show() {} };
 }
 
-// Views whose images were left out are in the table of scores alone.
+// Views without images are only in the table of scores.
 function startViews() {
   const seen = data.views.filter((entry) => entry.photograph !== undefined);
   const viewer = startViewer("views-body", seen, testPictures, (entry) => (entry.psnr === null ? entry.view : `${entry.view}, ${entry.psnr.toFixed(1)} dB`), "This page has no pictures of test views; the end of the page says why.");
@@ -203,8 +203,8 @@ function startTraining() {
 function startScores(viewer) {
   const table = document.getElementById("scores-table");
   if (!table) return;
-  const ofRun = !data.alone || distinct(data.views.map(runName)).length > 1;
-  const names = [...(ofRun ? ["Scene"] : []), "View", ...(data.alone ? [] : ["Arm"])];
+  const ofRun = !data.single || distinct(data.views.map(runName)).length > 1;
+  const names = [...(ofRun ? ["Scene"] : []), "View", ...(data.single ? [] : ["Arm"])];
   const head = element("tr", {}, ...names.map((text) => element("th", {}, text)), ...data.scores.map((score) => element("th", { class: "number" }, score.label)));
   table.tHead.append(head);
   const rows = data.views.flatMap((entry, place) => entry.arms.map((arm) => ({ entry, place, arm })));
@@ -221,13 +221,13 @@ function startScores(viewer) {
       const text = value === null ? "n/a" : value.toFixed(score.name.startsWith("psnr") ? 2 : 4);
       return element("td", { class: "number", "data-value": value ?? "" }, text);
     });
-    const row = element("tr", {}, ...(ofRun ? [element("td", {}, runName(entry))] : []), element("td", {}, name), ...(data.alone ? [] : [element("td", {}, arm.label)]), ...numbers);
+    const row = element("tr", {}, ...(ofRun ? [element("td", {}, runName(entry))] : []), element("td", {}, name), ...(data.single ? [] : [element("td", {}, arm.label)]), ...numbers);
     Object.assign(row.dataset, { scene: entry.scene, label: arm.label });
     table.tBodies[0].append(row);
   }
   makeSortable(table);
-  // On the page of one label by what orders the views above.
-  const by = data.alone ? Math.max(0, data.scores.findIndex((score) => score.name === "psnr")) : 0;
+  // The page of a single label sorts by PSNR, as the views above.
+  const by = data.single ? Math.max(0, data.scores.findIndex((score) => score.name === "psnr")) : 0;
   sortBy(table, names.length + by, !data.scores[by].higher);
   onFilter.push(() => {
     for (const row of table.tBodies[0].rows) row.hidden = !passes(row.dataset);

@@ -22,27 +22,27 @@ class Settings:
     """The keys under `components.plugins.mip_off_late` of the config."""
 
     variance: float = 0.0
-    """The variance of the filter, px^2 of the finest view that sees a Gaussian; 0 is off;
-    Mip-Splatting's is 0.2."""
+    """The variance of the filter, px^2 of the finest view that sees a Gaussian; 0 is off.
+    Mip-Splatting's value is 0.2."""
     every: int = 100
     """Steps of this run between two updates of the sampling rates; Mip-Splatting's value."""
     until: int = 20_000
-    """The step of a 30,000-step run before which the filter becomes part of the Gaussians, which
-    are trained without it from there on. Our choice."""
+    """The step of a 30,000-step run from which on Gaussians are trained without the filter, which
+    becomes part of them just before. Our choice."""
 
 
 class MipOffLate(Mip):
-    """The component `mip` of xrgs, until a step.
+    """The component `mip` of xrgs, only until a step.
 
-    Just before step `until` the filter becomes part of the trained scales and opacities, and the
-    render stays the same. If the filter were dropped, every Gaussian would become smaller and more
-    opaque at that step. Adam's moments stay as they are. All of it is our choice.
+    Just before step `until` the filter is applied to the trained scales and opacities for good, so
+    that the render stays the same. If the filter were only dropped, every Gaussian would become
+    smaller and more opaque at that step. Adam's moments stay as they are. All of it is our choice.
     """
 
     settings_type = Settings
 
     def __init__(self, settings: Settings, views: Sequence[TrainingView], near: float) -> None:
-        """Take the cameras and masks, and the depth below which nothing is rendered."""
+        """Take cameras and masks from the views, and the near plane's depth, world units."""
         super().__init__(MipConf(variance=settings.variance, every=settings.every), views, near)
         self.until = settings.until
         self.baked = False
@@ -67,7 +67,7 @@ class MipOffLate(Mip):
         return cls(settings, setup.data.train, setup.splat.raster.near)
 
     def opacity_attenuation(self, gaussians: Gaussians) -> Tensor | None:
-        """Return the factors [N] by which the filter lowers the opacities; None without it."""
+        """Return the factors [N] of the filter on the opacities; None after step `until`."""
         return None if self.baked else super().opacity_attenuation(gaussians)
 
     def on_gaussians_changed(self, gaussians: Gaussians) -> None:
@@ -91,7 +91,7 @@ class MipOffLate(Mip):
             super().bake(gaussians)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the filter, and where it is."""
+        """Return the filter, and whether it is part of the Gaussians."""
         return super().state_dict() | {"baked": self.baked}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:

@@ -28,12 +28,12 @@ class Settings:
     """The keys under `components.plugins.near_gradients` of the config."""
 
     share: float = 0.0
-    """In a training view, gradients of Gaussians nearer than this times the median depth of its SfM
-    points are lessened; 0 is off. Our choice: 0.5."""
+    """In a training view, gradients are reduced for Gaussians nearer than this share of the median
+    depth of the view's SfM points; 0 is off. Our choice: 0.5."""
 
 
 class NearGradients(Component):
-    """Lessens what a view does to Gaussians close to its camera, where floaters are.
+    """Reduces a view's gradients for Gaussians close to its camera, where floaters are.
 
     Let z_iv be the depth of Gaussian i in training view v, and m_v the median depth of the SfM
     points that project into the image of v. At a step on view v, the gradients of all parameters of
@@ -45,13 +45,13 @@ class NearGradients(Component):
     ray by min(1, d^2), where d is the distance from the camera in units of the scene. The density
     of a camera's rays falls with d^2, so that the space close to a camera gets the most gradients.
 
-    Our choice: the depth in place of the distance, and the unit `share` m_v, which follows from
-    each view. Adam's steps do not depend on the size of gradients, so that this hardly slows a
-    Gaussian that one view alone sees. Where several views see a Gaussian, the farther views move it
+    Our choice: the depth instead of the distance, and the unit `share` m_v, which each view has for
+    itself. Adam's steps do not depend on the size of gradients, so that this hardly slows a
+    Gaussian that only one view sees. If several views see a Gaussian, the farther views move it
     most. Densification, whose threshold is absolute, grows fewer Gaussians close to cameras.
 
-    Masks are not read: the space before the scene is empty at hidden pixels too. A view without an
-    SfM point in its image lessens no gradient.
+    Masks are not read: the space in front of the scene is empty at hidden pixels, too. A view
+    without an SfM point in its image reduces no gradient.
     """
 
     settings_type = Settings
@@ -60,9 +60,9 @@ class NearGradients(Component):
         """Measure the median depth of the SfM points [P, 3], world units, in each view."""
         self.share = settings.share
         self.median = {view.name: _median_depth(points, view.camera) for view in views}
-        """The median depth of each view's SfM points, world units; 0 of none."""
+        """View -> the median depth of its SfM points, world units; 0 without points."""
         self.factors: Tensor | None = None
-        """The factors [N] of the step's gradients; None before the first step."""
+        """The factors [N] on the step's gradients; None before the first step."""
 
     @classmethod
     def from_settings(cls, settings: Settings, setup: TrainingSetup) -> Self | None:
@@ -75,9 +75,9 @@ class NearGradients(Component):
         return cls(settings, setup.data.train, setup.data.points) if settings.share else None
 
     def after_backward(self, gaussians: Gaussians, step: Step) -> None:
-        """Multiply the gradients of Gaussians close to the step's camera.
+        """Reduce the gradients of Gaussians close to the step's camera.
 
-        `near_gradients.near` records the number of Gaussians with smaller gradients than before.
+        `near_gradients.near` records the number of Gaussians with reduced gradients.
         """
         unit = self.share * self.median[step.view.name]
         depth = step.view.camera.to_camera(gaussians.means.detach())[2]  # [N]
@@ -91,13 +91,13 @@ class NearGradients(Component):
                     step.log["near_gradients.near"] = int((near & (gradient != 0)).sum())
 
     def densification_grad2d(self, grad2d: Tensor, step: Step) -> Tensor:
-        """Multiply the image-plane gradients [N, 2] likewise."""
+        """Reduce the image-plane gradients [N, 2] by the same factors."""
         del step
         return grad2d if self.factors is None else grad2d * self.factors[:, None]
 
 
 def _median_depth(points: Tensor, camera: Camera) -> float:
-    """The median depth of the points [P, 3] in a view's image; 0 of none."""
+    """Return the median depth of the points [P, 3] in a view's image; 0 without points."""
     _, _, depth, inside = camera.in_image(points)
     if not inside.any():
         return 0.0

@@ -1,4 +1,4 @@
-"""The weight of an LR view in the loss, by what its photograph has that no render explains."""
+"""A weight of each LR view in the loss, which falls with the view's residual."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ if TYPE_CHECKING:
 
 
 _LEAST_RATE = 0.1
-"""The running means are over about the last ten steps on a view; our choice."""
+"""The least weight of a new value in a running mean, so that the mean covers about the last ten
+steps on a view; our choice."""
 
 
 @dataclass
@@ -43,39 +44,38 @@ class Settings:
 class NoiseWeighting(Component):
     """Multiplies the loss of an LR view by a weight that falls with the view's own residual.
 
-    Let the values of photograph v be those of the render and Gaussian noise of an unknown variance
-    s_v. The negative logarithm of the likelihood of its N_v values is
+    Model photograph v as the render plus Gaussian noise of unknown variance s_v. The negative log
+    likelihood of its N_v values is
 
         N_v / 2 log(s_v) + sum of |render - photograph|^2 / (2 s_v).
 
-    Its minimum over s_v is at r_v, the mean squared residual. The likelihood then weighs the
-    residuals of the view by 1 / r_v. From step `begin` on, the loss of LR view v is multiplied by
+    It is least for s_v = r_v, the mean squared residual, and then weighs the residuals of the view
+    by 1 / r_v. So from step `begin` on, the loss of LR view v is multiplied by
 
         w_v = min(1, max(floor, r_HR / r_v)),
 
-    where r_HR is the mean of r_v over the HR views, and an HR view has weight 1.
+    where r_HR is the mean of r_v over the HR views. HR views have weight 1.
 
     Ours:
 
-    - Residuals are compared at one sampling rate. An HR photograph has detail that no LR photograph
-      has, and with it larger residuals: at the photographs' own sizes r_HR / r_v is above 1. So
-      the residual of each view is first brought down (antialiased bicubic) to the lowest sampling
+    - Residuals are compared at one sampling rate. An HR photograph has more detail than any LR
+      photograph, and so larger residuals: at the photographs' own sizes r_HR / r_v is above 1. So
+      the residual of each view is first downsampled (antialiased bicubic) to the lowest sampling
       rate of all views.
     - r_v is a running mean over about the last ten steps on the view, of the pixels inside its
       mask. It is measured from the first step on.
-    - The likelihood is of squared residuals. Most of the loss is their absolute value, for which
-      the best weight would be the root of w_v.
+    - The likelihood has squared residuals. Most of the loss is their absolute value, for which the
+      best weight would be the root of w_v.
 
-    What the render cannot explain counts as noise, whatever it is. What the splats imitate does not
-    count, and they imitate much: a blur that training knows nothing of, and noise where views are
-    few. So this is a guard against single photographs that fit nothing else, and not a measure of
-    noise.
+    Every residual counts as noise, whatever its cause. But Gaussians imitate a lot, such as an
+    unknown blur, or noise that only few views see, and then leave no residual. So this is a guard
+    against single photographs that fit no others, and not a measure of noise.
 
     The hooks of plugins run after those of xrgs's own components, so that the weight multiplies the
     penalties of `regularization`, `exposure` and `formation` as well.
 
-    Adam [kingma2015] divides a gradient by its recent size, so that a weight acts only where LR and
-    HR views reach the same Gaussian.
+    Adam [kingma2015] divides a gradient by its recent size, so that a weight only has an effect on
+    Gaussians that both LR and HR views see.
 
     `noise_weighting.residual_HR` and `residual_LR` record the root of r_v, in values of range 1,
     and `noise_weighting.LR` the weight of an LR view.
@@ -86,7 +86,7 @@ class NoiseWeighting(Component):
     def __init__(
         self, settings: Settings, views: Sequence[TrainingView], backend: str = "torch"
     ) -> None:
-        """Take the sizes at which residuals are compared.
+        """Compute the sizes at which residuals are compared.
 
         Args:
             settings: `components.plugins.noise_weighting` of the config.
@@ -115,9 +115,9 @@ class NoiseWeighting(Component):
         }
         """Height and width of each view at the lowest sampling rate."""
         self.residuals: dict[str, float] = {}
-        """r_v of the views that had a step."""
+        """View -> r_v, for views that had a step."""
         self.steps: dict[str, int] = {}
-        """The number of steps on each of these views."""
+        """View -> its number of steps, for the same views."""
 
     @classmethod
     def from_settings(cls, settings: Settings, setup: TrainingSetup) -> Self | None:
@@ -133,7 +133,7 @@ class NoiseWeighting(Component):
         return None if settings.floor == 1 else cls(settings, setup.data.train, setup.backend)
 
     def modify_loss(self, loss: Tensor, image: Tensor, gaussians: Gaussians, step: Step) -> Tensor:
-        """Measure the residual of the view; return the loss, or from `begin` on its product."""
+        """Measure the view's residual; return the loss, from `begin` on times the view's weight."""
         del gaussians
         view = step.view
         self._measure(image.detach() - view.image, view)
@@ -154,7 +154,7 @@ class NoiseWeighting(Component):
         return min(1.0, max(self.settings.floor, ratio))
 
     def findings(self) -> list[str]:
-        """Return the lowest and the highest weight with the names of the photographs."""
+        """Return a sentence on the lowest and the highest weight, with the photographs' names."""
         weights = {n: self.weight(n) for n in self.residuals if n not in self.hr_names}
         if not weights:
             return []
@@ -175,7 +175,7 @@ class NoiseWeighting(Component):
 
     @torch.no_grad()
     def _measure(self, residual: Tensor, view: TrainingView) -> None:
-        """Take the residual [H, W, 3] of a step, 0 outside the mask, into the view's mean."""
+        """Update the view's r_v by the residual [H, W, 3] of a step, 0 outside the mask."""
         brought_down = resize(residual, *self.sizes[view.name], backend=self.backend)
         used = 1.0 if view.mask is None else int(view.mask.sum()) / view.mask.numel()
         square = rounded_mean(brought_down * brought_down) / used

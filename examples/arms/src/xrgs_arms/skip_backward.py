@@ -18,9 +18,9 @@ class Settings:
     """The keys under `components.plugins.skip_backward` of the config."""
 
     share: float = 1.0
-    """The least share of the steps from `begin` on that have a backward pass; 1 is off."""
+    """The least share of steps with a backward pass, from `begin` on; 1 is off."""
     tolerance: float = 0.0
-    """How far above the view's mean the loss of a skipped step may be, relative."""
+    """A step may be skipped if its loss is at most this far above the view's mean, relative."""
     decay: float = 0.95
     """The decay of the running mean of a view's loss, per step on the view; SkipGS's value."""
     begin: int = 15_000
@@ -28,25 +28,24 @@ class Settings:
 
 
 class SkipBackward(Component):
-    """Skips the backward pass where the loss of a view is no higher than its running mean.
+    """Skips the backward pass of a step if its view's loss is not above its running mean.
 
     SkipGS [li2026skipgs] renders every step. After densification has stopped it skips the backward
     pass and the optimizer's step if the view's loss is consistent with its recent values, as long
-    as a given share of the steps has a backward pass. From step `begin` on, let L be the loss of a
-    step on view v, n the number of such steps so far, this one included, and b the number of
-    backward passes so far. The step is skipped if
+    as a given share of the steps has a backward pass. Let L be the loss of a step on view v, n the
+    number of steps since `begin`, including this one, and b the number of backward passes since
+    `begin`. The step is skipped if
 
         L <= (1 + tolerance) mean_v    and    b >= share n
 
-    and then, whether it was skipped or not, mean_v = decay mean_v + (1 - decay) L. The first step
-    on a view is never skipped, and makes L its mean. A loss that is not finite leaves the mean as
-    it is.
+    Afterwards, skipped or not, mean_v = decay mean_v + (1 - decay) L. The first step on a view is
+    never skipped, and sets mean_v = L. A loss that is not finite does not change the mean.
 
-    The decay of 0.95, the tolerance of 0 and the comparison from above alone are from the
-    documentation of the authors' code. Our choice: `share` is a setting, which the authors derive
-    from a period without skipping; there is no such period here; and L has all terms and weights of
-    the other components. A loss that falls from visit to visit is below its mean, so that in a
-    short training `share` alone decides how many steps are skipped.
+    From the documentation of the authors' code: the decay of 0.95, the tolerance of 0, and that
+    only a high loss forces a backward pass. Our choice: `share` is a setting, which the authors
+    derive from a period without skipping; there is no such period here; and L has all terms and
+    weights of the other components. In a short training the loss of a view falls from step to step,
+    so it is below its mean, and only `share` decides how many steps are skipped.
     """
 
     settings_type = Settings

@@ -1,4 +1,4 @@
-"""Scores of the Gaussians by several training views, which choose what densification grows."""
+"""Scores of Gaussians by several training views, which decide what densification grows."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ class MultiviewSettings:
     """The keys under `components.plugins.multiview_score` of the config."""
 
     views: int = 0
-    """Training views that each refinement looks at; 0 is off; FastGS has 10."""
+    """Number of training views for the scores of each refinement; 0 is off; FastGS has 10."""
     error: float = 0.1
-    """The share of a view's largest error from which on an error is high; FastGS's value."""
+    """An error is high if it is above this share of a view's largest error; FastGS's value."""
     pixels: float = 0.0
-    """Pixels with a high error, weighted as they are blended, px^2 of the finest view, above which
-    a Gaussian may grow. FastGS counts pixels without a weight and has 5."""
+    """A Gaussian may grow if it shows more pixels with a high error than this, weighted as they are
+    blended, px^2 of the finest view. FastGS counts pixels without a weight and has 5."""
 
 
 @dataclass
@@ -43,18 +43,17 @@ class ErrorSettings:
     """The keys under `components.plugins.error_score` of the config."""
 
     of: str = "nothing"
-    """What Gaussians are ranked by: `edges` of the photographs that they show, `errors` of the
-    renders, or `nothing` (off: the image-plane gradient)."""
+    """The score that ranks Gaussians: the `edges` of the photographs or the `errors` of the renders
+    that they show, or `nothing` (off: the image-plane gradient ranks them)."""
     views: int = 10
-    """Training views that each refinement looks at; Improved-GS's value."""
+    """Number of training views for the scores of each refinement; Improved-GS's value."""
 
 
 class _ViewScores(Component):
-    """Gives each Gaussian the mean of its scores in some training views.
+    """Computes for each Gaussian the mean of its scores in some training views.
 
-    The views are drawn anew at each refinement, from all training views without repetition. They
-    are rendered with all components of the run, and their alpha evaluations and time count as the
-    run's.
+    The views are drawn at each refinement, from all training views without repetition. They are
+    rendered with all components of the run; their alpha evaluations and time count for the run.
     """
 
     renderer: ViewRenderer
@@ -63,7 +62,7 @@ class _ViewScores(Component):
         self.views, self.count, self.seed = views, min(count, len(views)), seed
 
     def before_training(self, renderer: ViewRenderer) -> None:
-        """Keep what renders the views."""
+        """Store the renderer of views."""
         self.renderer = renderer
 
     def score_in_view(self, gaussians: Gaussians, step: Step) -> Tensor:
@@ -71,8 +70,8 @@ class _ViewScores(Component):
         raise NotImplementedError
 
     def scores(self, gaussians: Gaussians, step: Step) -> Tensor:
-        """Return the mean scores [N] in the views of a refinement."""
-        # By the seed and the number of the step alone, so that a checkpoint needs no state.
+        """Return the mean scores [N] over the views of a refinement."""
+        # The draw depends only on seed and step, so that a checkpoint needs no state.
         generator = seeded_generator(self.seed, f"{type(self).__name__} {step.number}")
         total = gaussians.opacities.new_zeros(len(gaussians))
         for index in torch.randperm(len(self.views), generator=generator)[: self.count].tolist():
@@ -81,30 +80,30 @@ class _ViewScores(Component):
 
 
 class MultiviewScore(_ViewScores):
-    """Lets only Gaussians grow that show many pixels with a high error, in the mean of some views.
+    """Lets a Gaussian grow only if it shows many pixels with a high error, in the mean of views.
 
     Multi-view consistent densification [ren2025fastgs]. In each of `views` training views, the
-    absolute difference between render and photograph, averaged over the channels, is brought to
-    0..1 by its smallest and largest value in the view. A pixel's error is high if the result is
-    above `error`. A Gaussian above the growth threshold may grow if
+    absolute difference between render and photograph, averaged over the channels, is scaled to 0..1
+    by its smallest and largest value in the view. A pixel's error is high if the result is above
+    `error`. A Gaussian above the growth threshold may grow if
 
         s_i = mean over the views of  (1 / rho^2) sum over p of [error of p is high] w_i(p)
             > pixels
 
     where w_i(p) is the weight with which Gaussian i is blended into pixel p (`attribute_pixels`).
 
-    Ours: FastGS counts the pixels of the footprint, whatever the weight, and asks for more than 5
-    pixels. A sum of weights needs no kernel of its own, and a Gaussian that is faint or hidden in a
-    pixel does not answer for its error. The sum is a few hundredths of the count, so that `pixels`
-    is another number than 5. rho is the sampling rate of the view relative to the finest view
+    Ours: FastGS counts the pixels of the footprint without weights, and demands more than 5 pixels.
+    A sum of weights needs no extra kernel, and does not blame a Gaussian that is faint or hidden in
+    a pixel for its error. The sum is a few hundredths of the count, so that `pixels` is far below
+    5. rho is the sampling rate of the view relative to the finest view
     (`TrainingView.sampling_rate`), so that the sum is in px^2 of the finest view: a pixel of an LR
     view that is 5 times smaller counts 25.
 
     FastGS's pruning is left out. Four times after densification it removes Gaussians with an
     opacity below 0.1, and those with more than 0.9 of the largest sum of such scores, each times
     the view's loss. In our trials the score chose one or two Gaussians at a time, and a lower share
-    than 0.9 cost quality. The opacity chose nearly all; to remove transparent Gaussians after
-    densification is what `natural_selection` is for.
+    than 0.9 cost quality. Nearly all were chosen by their opacity, and `natural_selection` is the
+    component for removing transparent Gaussians after densification.
     """
 
     settings_type = MultiviewSettings
@@ -158,13 +157,13 @@ class ErrorScore(_ViewScores):
     where w_i(p) is the weight with which Gaussian i is blended into pixel p (`attribute_pixels`).
     Each view has the same mean score, so that HR and LR views count alike. The map e_j is one of
 
-    - `edges`: the absolute Laplacian of the photograph's brightness, over 3 x 3 pixels, brought to
+    - `edges`: the absolute Laplacian of the photograph's brightness, over 3 x 3 pixels, scaled to
       0..1 by its smallest and largest value in the view;
     - `errors`, ours: the absolute difference between the render and the photograph, averaged over
       the channels.
 
-    Ours besides: the Laplacian's absolute value, where the image library of the authors cuts
-    negative values off, and the highest scores instead of a random choice by them.
+    Also ours: the Laplacian's absolute value, while the authors' image library clips negative
+    values; and the highest scores grow, instead of a random choice weighted by the scores.
     """
 
     settings_type = ErrorSettings
@@ -193,12 +192,12 @@ class ErrorScore(_ViewScores):
         return self.scores(gaussians, step)
 
     def score_in_view(self, gaussians: Gaussians, step: Step) -> Tensor:
-        """Return the sums [N] over the view's map, relative to their mean where above 0."""
+        """Return the sums a_ij [N] over the view's map, divided by the mean of positive sums."""
         if self.of == "edges":
             pixels = _in_unit_range(edges(step.view.image), step.view.mask)
         else:
             pixels = _mean_error(self.renderer.photograph(gaussians, step), step.view.image)
-        # Bringing a render down weighs some pixels with less than 0.
+        # Downsampling a render gives some pixels negative weights.
         sums = self.renderer.attribute(pixels, gaussians, step).clamp_min(0)
         shown = sums > 0
         mean = sums.sum(dtype=torch.float64) / shown.sum().clamp_min(1)
@@ -228,16 +227,16 @@ def edges(image: Tensor) -> Tensor:
 
 
 def _mean_error(image: Tensor, photograph: Tensor) -> Tensor:
-    """The mean over the channels [H, W] of the absolute difference of two images [H, W, 3]."""
+    """Return the absolute difference of two images [H, W, 3], averaged over channels: [H, W]."""
     error = (image - photograph).abs()
     # Written out: the order in which torch adds depends on the processor.
     return (error[..., 0] + error[..., 1] + error[..., 2]) / 3
 
 
 def _in_unit_range(values: Tensor, mask: Tensor | None) -> Tensor:
-    """Values [H, W] brought to 0..1 by the smallest and the largest; all 0 where they are equal.
+    """Scale values [H, W] to 0..1 by the smallest and the largest; all 0 if they are equal.
 
-    Values outside the mask are 0, and are neither of the two.
+    Values outside the mask become 0, and are ignored for the smallest and the largest.
     """
     used = values if mask is None else values[mask]
     low, high = used.min(), used.max()
