@@ -5,7 +5,7 @@ the paper leaves open is fixed in the docstrings of the components, under "our c
 paper is silent".
 
 `xrgs.registry` lists the components. A component of another package is not in it:
-`xrgs.plugins` finds it by its entry point. CONTRIBUTING.md says how to write either kind.
+`xrgs.plugins` finds it by its entry point. docs/extend.md says how to write either kind.
 """
 
 from __future__ import annotations
