@@ -37,6 +37,21 @@ def test_links_lead_somewhere(page: Path) -> None:
         assert not anchor or anchor in anchors(target), link
 
 
+def test_pages_that_code_and_notes_name_are_there() -> None:
+    """Messages, docstrings and comments send readers to `docs/NAME.md`."""
+    folders = ("xrgs", "hydra_plugins", "tests", "conf", "sweeps", "examples", "benchmarks")
+    files = [file for name in (*folders, "findings", ".ci") for file in (ROOT / name).rglob("*")]
+    texts = {".py", ".h", ".cpp", ".sh", ".yaml", ".md", ".toml", ""}
+    named = {
+        page
+        for file in [*files, *ROOT.glob("*.*")]
+        if file.is_file() and file.suffix in texts and file.name != "CHANGELOG.md"
+        for page in re.findall(r"\bdocs/\w+\.md\b", file.read_text(encoding="utf-8"))
+    }
+    assert "docs/your_photographs.md" in named
+    assert named <= {f"docs/{page.name}" for page in (ROOT / "docs").glob("*.md")}
+
+
 def test_the_findings_are_listed_and_run() -> None:
     scripts = sorted((ROOT / "findings").glob("*.sh"))
     listed = re.findall(
@@ -49,7 +64,7 @@ def test_the_findings_are_listed_and_run() -> None:
 def test_the_tested_versions_are_those_that_are_allowed() -> None:
     table = re.findall(
         r"^\| ([\w-]+) \| ([\d.]+) \| ([\d.]+) \|",
-        (ROOT / "docs/versions.md").read_text(),
+        (ROOT / "CONTRIBUTING.md").read_text(),
         re.MULTILINE,
     )
     tested = {name: versions for name, *versions in table}
