@@ -90,7 +90,7 @@ def test_the_file_of_the_baseline_has_every_key_of_the_schema() -> None:
     assert keys == {name for name, _ in schema_keys()}
 
 
-#: The keys that are gsplat's own, by its names of them: in `Config` of `examples/simple_trainer.py`,
+#: The keys that are gsplat's own, by its names: in `Config` of `examples/simple_trainer.py`,
 #: in `DefaultStrategy` and `MCMCStrategy` of `gsplat/strategy/`, in `rasterization`, as an argument
 #: of the optimizers that the trainer makes, or in the kernels (version 1.5.3).
 GSPLATS = {

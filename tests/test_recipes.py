@@ -118,7 +118,9 @@ def done_cells(copy: Copy, *arguments: str) -> str:
 
 
 def test_every_recipe_is_followed_by_a_test() -> None:
-    followed = re.findall(r'^    copy\.follow\("(\w+)"\)$', Path(__file__).read_text(), re.MULTILINE)
+    followed = re.findall(
+        r'^    copy\.follow\("(\w+)"\)$', Path(__file__).read_text(), re.MULTILINE
+    )
     assert sorted(followed) == sorted(RECIPES)
     assert (ROOT / "docs/extend.md").read_text().count("\n## ") == len(RECIPES)
 
