@@ -200,7 +200,7 @@ def components_page() -> str:
         " [`components`](conf/config.md#components), switch it on. The docstring of its class says"
         " what it does. They stand in the order in which their hooks run."
         " [The method](method.md) has the paper's formulas on one page, and"
-        " [Add a component](add_component.md) says how to write one.",
+        " [Add a component](extend.md#add-a-component) says how to write one.",
     ]
     options = ("members: []", "show_root_heading: false", "show_bases: false")
     lines = "".join(f"\n      {option}" for option in options)

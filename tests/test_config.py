@@ -90,6 +90,74 @@ def test_the_file_of_the_baseline_has_every_key_of_the_schema() -> None:
     assert keys == {name for name, _ in schema_keys()}
 
 
+#: The keys that are gsplat's own, by its names: in `Config` of `examples/simple_trainer.py`,
+#: in `DefaultStrategy` and `MCMCStrategy` of `gsplat/strategy/`, in `rasterization`, as an argument
+#: of the optimizers that the trainer makes, or in the kernels (version 1.5.3).
+GSPLATS = {
+    "splat.sh_every": "Config.sh_degree_interval",
+    "splat.init_opacity": "Config.init_opa",
+    "splat.init_scale": "Config.init_scale",
+    "splat.ssim_weight": "Config.ssim_lambda",
+    "splat.raster.sh_degree": "Config.sh_degree",
+    "splat.raster.near": "Config.near_plane",
+    "splat.raster.eps2d": "rasterization(eps2d)",
+    "splat.raster.alpha_min": "ALPHA_THRESHOLD of the kernels",
+    "splat.raster.alpha_max": "the cap of alpha in the kernels",
+    "splat.raster.transmittance_min": "the threshold of the transmittance in the kernels",
+    "splat.raster.antialiased": "Config.antialiased",
+    "splat.raster.background": "rasterization(backgrounds)",
+    "splat.raster.absgrad": "DefaultStrategy.absgrad",
+    "splat.optimizer.means": "Config.means_lr",
+    "splat.optimizer.means_final": "ExponentialLR(gamma)",
+    "splat.optimizer.scales": "Config.scales_lr",
+    "splat.optimizer.opacities": "Config.opacities_lr",
+    "splat.optimizer.quats": "Config.quats_lr",
+    "splat.optimizer.sh0": "Config.sh0_lr",
+    "splat.optimizer.shN": "Config.shN_lr",
+    "splat.optimizer.beta1": "Adam(betas)",
+    "splat.optimizer.beta2": "Adam(betas)",
+    "splat.optimizer.eps": "Adam(eps)",
+    "splat.densify.start": "DefaultStrategy.refine_start_iter",
+    "splat.densify.stop": "DefaultStrategy.refine_stop_iter",
+    "splat.densify.every": "DefaultStrategy.refine_every",
+    "splat.densify.reset_every": "DefaultStrategy.reset_every",
+    "splat.densify.grow_grad2d": "DefaultStrategy.grow_grad2d",
+    "splat.densify.grow_scale3d": "DefaultStrategy.grow_scale3d",
+    "splat.densify.prune_opacity": "DefaultStrategy.prune_opa",
+    "splat.densify.prune_scale3d": "DefaultStrategy.prune_scale3d",
+    "splat.densify.reset_opacity": "reset_opa(value=self.prune_opa * 2.0)",
+    "splat.densify.noise": "MCMCStrategy.noise_lr",
+}
+
+
+def keys_that_files_set() -> set[str]:
+    """Keys of the config that a file of this repository sets, but for the baseline's."""
+    root = Path(__file__).parents[1]
+    sweeps = (root / "sweeps").glob("*.yaml")
+    keys = {name for file in sweeps for name, *_ in yaml_leaves(file)}
+    for folder in (CONF_DIR, *root.glob("reports/*/conf"), *root.glob("examples/*/conf")):
+        for file in folder.glob("*/**/*.yaml"):
+            group = file.relative_to(folder).parts[0]
+            whole = file.read_text(encoding="utf-8").startswith("# @package _global_\n")
+            prefix = "" if whole else f"{group}."
+            keys |= {prefix + name for name, *_ in yaml_leaves(file)}
+    return {key.removeprefix("hydra.sweeper.params.").removeprefix("+") for key in keys}
+
+
+def test_every_key_is_gsplats_or_set_by_a_file_or_explained_on_a_page() -> None:
+    """A key that no study changes and no page explains would be a constant."""
+    pages = (Path(__file__).parents[1] / "docs").glob("*.md")
+    text = "\n".join(page.read_text(encoding="utf-8") for page in pages)
+    known = keys_that_files_set() | GSPLATS.keys()
+    keys = {name for name, _ in schema_keys()}
+    assert keys >= GSPLATS.keys()
+    assert not {
+        key
+        for key in keys - known
+        if not re.search(rf"(?<![\w.]){re.escape(key)}(?=[=`]|\.NAME)", text)
+    }
+
+
 def test_the_values_of_the_baseline_are_of_the_schemas_types() -> None:
     """As they are in the file: OmegaConf would convert `"1"` for a number."""
     conf = OmegaConf.load(CONF_DIR / "config.yaml")

@@ -37,6 +37,34 @@ def test_links_lead_somewhere(page: Path) -> None:
         assert not anchor or anchor in anchors(target), link
 
 
+def test_pages_that_code_and_notes_name_are_there() -> None:
+    """Messages, docstrings and comments send readers to pages of `docs/`."""
+    folders = ("xrgs", "hydra_plugins", "tests", "conf", "sweeps", "examples", "benchmarks")
+    files = [file for name in (*folders, "findings", ".ci") for file in (ROOT / name).rglob("*")]
+    texts = {".py", ".h", ".cpp", ".sh", ".yaml", ".md", ".toml", ""}
+    named = {
+        page
+        for file in [*files, *ROOT.glob("*.*")]
+        if file.is_file() and file.suffix in texts and file.name != "CHANGELOG.md"
+        for page in re.findall(r"\bdocs/\w+\.md\b", file.read_text(encoding="utf-8"))
+    }
+    assert "docs/your_photographs.md" in named
+    assert named <= {f"docs/{page.name}" for page in (ROOT / "docs").glob("*.md")}
+
+
+def test_the_tree_of_the_readme_has_every_page_and_every_package() -> None:
+    tree = (ROOT / "README.md").read_text(encoding="utf-8").partition("## Files\n\n```\n")[2]
+    parts = re.split(r"^(\w+)/", tree.partition("```")[0], flags=re.MULTILINE)
+    inside = dict(zip(parts[1::2], parts[2::2], strict=True))
+    assert all((ROOT / folder).is_dir() for folder in inside)
+    listed = re.findall(r"^  (\w+(?:, \w+)*)  ", inside["docs"], re.MULTILINE)
+    pages = {page.stem for page in (ROOT / "docs").glob("*.md")}
+    assert sorted(", ".join(listed).split(", ")) == sorted(pages)
+    packages = re.findall(r"^  (\w+)/  ", inside["xrgs"], re.MULTILINE)
+    folders = {path.name for path in (ROOT / "xrgs").iterdir() if path.is_dir()}
+    assert sorted(packages) == sorted(folders - {"__pycache__"})
+
+
 def test_the_findings_are_listed_and_run() -> None:
     scripts = sorted((ROOT / "findings").glob("*.sh"))
     listed = re.findall(
@@ -49,7 +77,7 @@ def test_the_findings_are_listed_and_run() -> None:
 def test_the_tested_versions_are_those_that_are_allowed() -> None:
     table = re.findall(
         r"^\| ([\w-]+) \| ([\d.]+) \| ([\d.]+) \|",
-        (ROOT / "docs/versions.md").read_text(),
+        (ROOT / "CONTRIBUTING.md").read_text(),
         re.MULTILINE,
     )
     tested = {name: versions for name, *versions in table}

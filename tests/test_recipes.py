@@ -1,4 +1,4 @@
-"""Follows each recipe of docs/add_*.md to the letter, in a copy of the package.
+"""Follows each recipe of docs/extend.md to the letter, in a copy of the package.
 
 The sentence before a block of the document says where the block goes, in words that readers see.
 The copy comes first on the path of the commands that are then run as a contributor would run them.
@@ -30,6 +30,14 @@ BLOCK = re.compile(
     r"```\w+\n(.*?)```",
     re.DOTALL,
 )
+#: The sections of the document by their last words, as "component" of "Add a component".
+RECIPES: dict[str, str] = dict(
+    re.findall(
+        r"^## Add an? (\w+)\n(.*?)(?=^## |\Z)",
+        (ROOT / "docs/extend.md").read_text(encoding="utf-8"),
+        re.MULTILINE | re.DOTALL,
+    )
+)
 SMOKE = ("scene=motorcycle", "preset=smoke", "threads=1", "store=s")
 
 
@@ -40,10 +48,10 @@ class Copy:
     root: Path
 
     def follow(self, recipe: str) -> None:
-        """Put every block of a recipe where its comment says."""
-        text = (ROOT / "docs" / f"add_{recipe}.md").read_text(encoding="utf-8")
+        """Put every block of a recipe where the sentence before it says."""
+        text = RECIPES[recipe]
         blocks = BLOCK.findall(re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL))
-        # All blocks of code but those of a shell go somewhere; of add_scene, one is an example.
+        # All blocks of code but those of a shell go somewhere; of a scene, one is an example.
         total = len(re.findall(r"^```(?!sh)\w+$", text, re.MULTILINE)) - (recipe == "scene")
         assert len(blocks) == total
         for new, name, side, anchor, with_head, block in blocks:
@@ -114,6 +122,14 @@ def done_cells(copy: Copy, *arguments: str) -> str:
     """The plan's first line of the sweep that `trained` has run, after an edit."""
     printed = copy.run("sweep", "+ablation=consistency", *SMOKE, "dry_run=true", *arguments)
     return next(line for line in printed.splitlines() if line.startswith("plan:"))
+
+
+def test_every_recipe_is_followed_by_a_test() -> None:
+    followed = re.findall(
+        r'^    copy\.follow\("(\w+)"\)$', Path(__file__).read_text(), re.MULTILINE
+    )
+    assert sorted(followed) == sorted(RECIPES)
+    assert (ROOT / "docs/extend.md").read_text().count("\n## ") == len(RECIPES)
 
 
 def test_an_ablation(copy: Copy) -> None:

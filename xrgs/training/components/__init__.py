@@ -3,8 +3,8 @@
 A component that is off is not imported, so the baseline executes none of its code. The docstrings
 of the components list what the paper leaves open, under "our choice where the paper is silent".
 
-`xrgs.registry` lists the built-in components; `xrgs.plugins` finds those of other packages by their
-entry points. docs/add_component.md says how to write either kind.
+`xrgs.registry` lists the components. A component of another package is not in it:
+`xrgs.plugins` finds it by its entry point. docs/extend.md says how to write either kind.
 """
 
 from __future__ import annotations
