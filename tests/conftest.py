@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import importlib
 import json
 import os
@@ -25,6 +26,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import yaml
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hypothesis import HealthCheck, settings
 
 from tests import forks, pdflatex
@@ -60,6 +63,33 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def _one_torch_thread() -> None:
     """Let torch use one thread: a second one costs more than it gives on small tensors."""
     torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _hydra_reads_equal_text_once() -> Iterator[None]:
+    """Keep what Hydra parses of a word and of a file: most of the time of a config goes there."""
+    words: dict[tuple[str, str], Any] = {}
+    files: dict[tuple[str, str], Any] = {}
+    parse, load = OverridesParser.parse_rule, yaml.load
+
+    def parse_once(parser: OverridesParser, word: str, rule: str) -> Any:
+        if (word, rule) not in words:
+            words[word, rule] = parse(parser, word, rule)
+        return deepcopy(words[word, rule])
+
+    def load_once(stream: Any, Loader: Any) -> Any:
+        if isinstance(stream, str) or not stream.seekable():
+            return load(stream, Loader)
+        key = stream.read(), Loader.__name__
+        if key not in files:
+            stream.seek(0)
+            files[key] = load(stream, Loader)
+        return deepcopy(files[key])
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(OverridesParser, "parse_rule", parse_once)
+        patch.setattr("omegaconf.omegaconf.yaml.load", load_once)
+        yield
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -164,8 +194,7 @@ def _camera(width: int, height: int) -> Camera:
     return Camera(torch.eye(4), K, width, height)
 
 
-@pytest.fixture
-def data() -> Dataset:
+def ramps() -> Dataset:
     """Return four views of a smooth ramp, two HR and two LR, and 60 points in front of them."""
     generator = torch.Generator().manual_seed(3)
     points = torch.rand(60, 3, generator=generator) - 0.5 + torch.tensor([0.0, 0.0, 2.0])
@@ -179,6 +208,12 @@ def data() -> Dataset:
         views.append(LoadedView(f"v{number}", tag, camera, image, rho, supersampling=1 / rho))
     colors = torch.rand(60, 3, generator=generator)
     return Dataset(tuple(views), tuple(views[:1]), points, colors, scene_scale=1.0, factor=5)
+
+
+@pytest.fixture
+def data() -> Dataset:
+    """Return `ramps`."""
+    return ramps()
 
 
 def _command(name: str) -> list[str]:
@@ -218,13 +253,35 @@ def forked_command() -> Iterator[Callable[..., tuple[int, str, str]]]:
 
 
 @pytest.fixture(scope="session")
-def smoke_variants(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """(name, function of a folder) -> the folder, which the function has made for all workers."""
+    home = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        home = home.parent
+
+    def made(name: str, make: Callable[[Path], object]) -> Path:
+        folder = home / f"once-{name}"
+        with (home / f"once-{name}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not (folder / "made").exists():
+                folder.mkdir()  # an error where another worker has failed to make it
+                make(folder)
+                (folder / "made").touch()
+        return folder
+
+    return made
+
+
+@pytest.fixture(scope="session")
+def smoke_variants(made_once: Callable[..., Path]) -> Path:
     """The folder `variants` of a store, with the variant of `scene=motorcycle preset=smoke`."""
-    store = Store(tmp_path_factory.mktemp("smoke"))
-    conf = composed("scene=motorcycle", "preset=smoke")
-    store.prepare()
-    variant.build(conf.scene, conf.variant, store.variants, store.scenes)
-    return store.variants
+
+    def build(folder: Path) -> None:
+        store, conf = Store(folder / "s"), composed("scene=motorcycle", "preset=smoke")
+        store.prepare()
+        variant.build(conf.scene, conf.variant, store.variants, store.scenes)
+
+    return made_once("smoke", build) / "s" / "variants"
 
 
 @dataclass(frozen=True)

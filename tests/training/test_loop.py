@@ -14,6 +14,7 @@ import pytest
 import torch
 
 from tests.conftest import composed as compose
+from tests.conftest import ramps
 from tests.training.conftest import same
 from xrgs.config import CONF_DIR, Conf
 from xrgs.errors import XrgsError
@@ -341,16 +342,23 @@ ACTS_HERE = {
 }
 
 
+SHORT = ("train.steps=20", "splat.backend=auto")
+
+
+@pytest.fixture(scope="module")
+def plain() -> Gaussians:
+    """What the baseline makes of `data` in 20 steps."""
+    return train_cell(ramps(), compose(*SHORT)).gaussians
+
+
 @pytest.mark.slow
 # A dense start is off by itself on views of 12 px; tests/training/dense has its scenes.
 @pytest.mark.parametrize("ablation", [name for name in ABLATIONS if name != "dense"])
-def test_each_ablation_changes_the_result(data: Dataset, ablation: str) -> None:
-    overrides = ["train.steps=20", "splat.backend=auto"]
-    plain = train_cell(data, compose(*overrides))
-    conf = compose(*overrides, f"+ablation={ablation}", *ACTS_HERE.get(ablation, ()))
+def test_each_ablation_changes_the_result(data: Dataset, plain: Gaussians, ablation: str) -> None:
+    conf = compose(*SHORT, f"+ablation={ablation}", *ACTS_HERE.get(ablation, ()))
     if conf.matched_to is not None:  # as a sweep does
-        conf.components.count_matched.gaussians = round(0.8 * len(plain.gaussians))
-    assert not same(plain.gaussians, train_cell(data, conf).gaussians)
+        conf.components.count_matched.gaussians = round(0.8 * len(plain))
+    assert not same(plain, train_cell(data, conf).gaussians)
 
 
 @pytest.mark.slow
