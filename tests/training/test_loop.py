@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 
 from tests.conftest import composed as compose
 from tests.conftest import ramps
@@ -38,6 +39,8 @@ ABLATIONS = sorted(
 )
 
 
+#: The ablations that `plus` is made of.
+IN_PLUS = set(OmegaConf.load(CONF_DIR / "ablation" / "plus.yaml").defaults)
 #: The ablations that `plus` refuses, and the key that the message begins with.
 NOT_WITH_PLUS = {"mcmc": "splat.raster.absgrad"}
 
@@ -362,7 +365,7 @@ def test_each_ablation_changes_the_result(data: Dataset, plain: Gaussians, ablat
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("ablation", sorted({*ABLATIONS} - {*NOT_WITH_PLUS}))
+@pytest.mark.parametrize("ablation", sorted({*ABLATIONS} - {*NOT_WITH_PLUS} - IN_PLUS))
 def test_each_ablation_trains_with_plus_exposure_and_masks(data: Dataset, ablation: str) -> None:
     """Its 20 steps go through densification, selection and the late factor of `supersampled`."""
     conf = compose("train.steps=20", "splat.backend=auto", f"+ablation=[plus,exposure,{ablation}]")
