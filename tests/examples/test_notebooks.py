@@ -12,10 +12,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import matplotlib.pyplot as plt
 import nbformat
 import pytest
-from nbclient import NotebookClient
 from PIL import Image
 
 from xrgs import load_gaussians
@@ -31,6 +29,8 @@ def read(name: str) -> Any:
 
 def run(notebook: Any, folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Run a notebook; return its printed outputs and values as text."""
+    from nbclient import NotebookClient
+
     commands = Path(sys.executable).parent  # of this environment, active or not
     monkeypatch.setenv("PATH", f"{commands}{os.pathsep}{os.environ['PATH']}")
     resources = {"metadata": {"path": folder}}
@@ -55,6 +55,8 @@ def test_photographs_of_two_sizes_are_trained(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """With the line for a folder of one's own in place of the embedded scene."""
+    import matplotlib.pyplot as plt
+
     garden = tmp_path / "garden"
     garden.mkdir()
     cameras = dict(zip(procedural.names(12), procedural.viewmats(12), strict=True))
