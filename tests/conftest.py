@@ -34,6 +34,7 @@ from tests import forks, pdflatex
 from xrgs import composing, config
 from xrgs.evaluation.lpips import weights
 from xrgs.mixture import variant
+from xrgs.safeio import code
 from xrgs.splat.cameras import Camera
 from xrgs.store.store import Store
 from xrgs.training.dataset import Dataset, LoadedView
@@ -93,6 +94,24 @@ def _hydra_reads_equal_text_once() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
+def _equal_source_is_read_once() -> Iterator[None]:
+    """Keep what digests of code take from a file's text: tests edit copies of the package."""
+    own_imports = code._own_imports.__wrapped__
+    found: dict[bytes, frozenset[str]] = {}
+
+    def own_imports_once(file: Path, modified_ns: int) -> frozenset[str]:
+        content = file.read_bytes()
+        if content not in found:
+            found[content] = own_imports(file, modified_ns)
+        return found[content]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(code, "meaning", cache(code.meaning))
+        patch.setattr(code, "_own_imports", own_imports_once)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
 def _terminals_draw() -> Iterator[None]:
     """Let the terminals of tests draw lines anew, also where the tests run in one that can't."""
     with pytest.MonkeyPatch.context() as patch:
@@ -145,9 +164,8 @@ def published(lpips_weights: weights.Weights | None) -> weights.Weights:
     return lpips_weights
 
 
-@pytest.fixture
-def random_weights() -> weights.Weights:
-    """Return random weights of the shapes of LPIPS's network."""
+@cache
+def _random_weights() -> weights.Weights:
     rng = np.random.default_rng(0)
     arrays: dict[str, np.ndarray[Any, Any]] = {}
     channels, kernels = (3, 64, 192, 384, 256, 256), (11, 5, 3, 3, 3)
@@ -158,6 +176,12 @@ def random_weights() -> weights.Weights:
         arrays[f"conv{i}.bias"] = 0.1 * rng.normal(size=outputs)
         arrays[f"head{i}"] = rng.random(outputs)
     return {name: array.astype(np.float32) for name, array in arrays.items()}
+
+
+@pytest.fixture
+def random_weights() -> weights.Weights:
+    """Return random weights of the shapes of LPIPS's network, which a test may change."""
+    return deepcopy(_random_weights())
 
 
 @cache
