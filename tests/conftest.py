@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import importlib
+import io
 import json
 import os
 import shutil
@@ -79,7 +80,7 @@ def _hydra_reads_equal_text_once() -> Iterator[None]:
         return deepcopy(words[word, rule])
 
     def load_once(stream: Any, Loader: Any) -> Any:
-        if isinstance(stream, str) or not stream.seekable():
+        if not isinstance(stream, io.IOBase):
             return load(stream, Loader)
         key = stream.read(), Loader.__name__
         if key not in files:
@@ -89,7 +90,7 @@ def _hydra_reads_equal_text_once() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(OverridesParser, "parse_rule", parse_once)
-        patch.setattr("omegaconf.omegaconf.yaml.load", load_once)
+        patch.setattr(yaml, "load", load_once)
         yield
 
 
