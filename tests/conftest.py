@@ -68,6 +68,14 @@ def _one_torch_thread() -> None:
 
 
 @pytest.fixture(scope="session", autouse=True)
+def _no_disk_is_waited_for() -> Iterator[None]:
+    """Sync nothing in this process: no power fails while tests run."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda _: None)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
 def _hydra_reads_equal_text_once() -> Iterator[None]:
     """Keep what Hydra parses of a word and of a file: most of the time of a config goes there."""
     words: dict[tuple[str, str], Any] = {}
