@@ -22,11 +22,10 @@ from dataclasses import dataclass, field
 from functools import cache, partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-import torch
 import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hypothesis import HealthCheck, settings
@@ -36,9 +35,12 @@ from xrgs import composing, config
 from xrgs.evaluation.lpips import weights
 from xrgs.mixture import variant
 from xrgs.safeio import code
-from xrgs.splat.cameras import Camera
 from xrgs.store.store import Store
-from xrgs.training.dataset import Dataset, LoadedView
+
+# torch is imported where it is used: the process that hands out the tests needs none.
+if TYPE_CHECKING:
+    from xrgs.splat.cameras import Camera
+    from xrgs.training.dataset import Dataset
 
 # How long an example takes tells how busy the machine is, and fails no test.
 settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -64,6 +66,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture(scope="session", autouse=True)
 def _one_torch_thread() -> None:
     """Let torch use one thread: a second one costs more than it gives on small tensors."""
+    import torch
+
     torch.set_num_threads(1)
 
 
@@ -222,6 +226,10 @@ def baseline(compose: Callable[..., config.Conf]) -> config.Conf:
 
 
 def _camera(width: int, height: int) -> Camera:
+    import torch
+
+    from xrgs.splat.cameras import Camera
+
     focal = 1.2 * width
     K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
     return Camera(torch.eye(4), K, width, height)
@@ -229,6 +237,10 @@ def _camera(width: int, height: int) -> Camera:
 
 def ramps() -> Dataset:
     """Return four views of a smooth ramp, two HR and two LR, and 60 points in front of them."""
+    import torch
+
+    from xrgs.training.dataset import Dataset, LoadedView
+
     generator = torch.Generator().manual_seed(3)
     points = torch.rand(60, 3, generator=generator) - 0.5 + torch.tensor([0.0, 0.0, 2.0])
     views = []
