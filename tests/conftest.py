@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import importlib
+import io
 import json
 import os
 import shutil
@@ -20,20 +22,25 @@ from dataclasses import dataclass, field
 from functools import cache, partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-import torch
+import yaml
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hypothesis import HealthCheck, settings
 
 from tests import forks, pdflatex
 from xrgs import composing, config
 from xrgs.evaluation.lpips import weights
 from xrgs.mixture import variant
-from xrgs.splat.cameras import Camera
+from xrgs.safeio import code
 from xrgs.store.store import Store
-from xrgs.training.dataset import Dataset, LoadedView
+
+# torch is imported where it is used: the process that hands out the tests needs none.
+if TYPE_CHECKING:
+    from xrgs.splat.cameras import Camera
+    from xrgs.training.dataset import Dataset
 
 # How long an example takes tells how busy the machine is, and fails no test.
 settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -59,7 +66,62 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture(scope="session", autouse=True)
 def _one_torch_thread() -> None:
     """Let torch use one thread: a second one costs more than it gives on small tensors."""
+    import torch
+
     torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _no_disk_is_waited_for() -> Iterator[None]:
+    """Sync nothing in this process: no power fails while tests run."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda _: None)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _hydra_reads_equal_text_once() -> Iterator[None]:
+    """Keep what Hydra parses of a word and of a file: most of the time of a config goes there."""
+    words: dict[tuple[str, str], Any] = {}
+    files: dict[tuple[str, str], Any] = {}
+    parse, load = OverridesParser.parse_rule, yaml.load
+
+    def parse_once(parser: OverridesParser, word: str, rule: str) -> Any:
+        if (word, rule) not in words:
+            words[word, rule] = parse(parser, word, rule)
+        return deepcopy(words[word, rule])
+
+    def load_once(stream: Any, Loader: Any) -> Any:
+        if not isinstance(stream, io.IOBase):
+            return load(stream, Loader)
+        key = stream.read(), Loader.__name__
+        if key not in files:
+            stream.seek(0)
+            files[key] = load(stream, Loader)
+        return deepcopy(files[key])
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(OverridesParser, "parse_rule", parse_once)
+        patch.setattr(yaml, "load", load_once)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _equal_source_is_read_once() -> Iterator[None]:
+    """Keep what digests of code take from a file's text: tests edit copies of the package."""
+    own_imports = code._own_imports.__wrapped__
+    found: dict[bytes, frozenset[str]] = {}
+
+    def own_imports_once(file: Path, modified_ns: int) -> frozenset[str]:
+        content = file.read_bytes()
+        if content not in found:
+            found[content] = own_imports(file, modified_ns)
+        return found[content]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(code, "meaning", cache(code.meaning))
+        patch.setattr(code, "_own_imports", own_imports_once)
+        yield
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -115,9 +177,8 @@ def published(lpips_weights: weights.Weights | None) -> weights.Weights:
     return lpips_weights
 
 
-@pytest.fixture
-def random_weights() -> weights.Weights:
-    """Return random weights of the shapes of LPIPS's network."""
+@cache
+def _random_weights() -> weights.Weights:
     rng = np.random.default_rng(0)
     arrays: dict[str, np.ndarray[Any, Any]] = {}
     channels, kernels = (3, 64, 192, 384, 256, 256), (11, 5, 3, 3, 3)
@@ -128,6 +189,12 @@ def random_weights() -> weights.Weights:
         arrays[f"conv{i}.bias"] = 0.1 * rng.normal(size=outputs)
         arrays[f"head{i}"] = rng.random(outputs)
     return {name: array.astype(np.float32) for name, array in arrays.items()}
+
+
+@pytest.fixture
+def random_weights() -> weights.Weights:
+    """Return random weights of the shapes of LPIPS's network, which a test may change."""
+    return deepcopy(_random_weights())
 
 
 @cache
@@ -159,14 +226,21 @@ def baseline(compose: Callable[..., config.Conf]) -> config.Conf:
 
 
 def _camera(width: int, height: int) -> Camera:
+    import torch
+
+    from xrgs.splat.cameras import Camera
+
     focal = 1.2 * width
     K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
     return Camera(torch.eye(4), K, width, height)
 
 
-@pytest.fixture
-def data() -> Dataset:
+def ramps() -> Dataset:
     """Return four views of a smooth ramp, two HR and two LR, and 60 points in front of them."""
+    import torch
+
+    from xrgs.training.dataset import Dataset, LoadedView
+
     generator = torch.Generator().manual_seed(3)
     points = torch.rand(60, 3, generator=generator) - 0.5 + torch.tensor([0.0, 0.0, 2.0])
     views = []
@@ -179,6 +253,12 @@ def data() -> Dataset:
         views.append(LoadedView(f"v{number}", tag, camera, image, rho, supersampling=1 / rho))
     colors = torch.rand(60, 3, generator=generator)
     return Dataset(tuple(views), tuple(views[:1]), points, colors, scene_scale=1.0, factor=5)
+
+
+@pytest.fixture
+def data() -> Dataset:
+    """Return `ramps`."""
+    return ramps()
 
 
 def _command(name: str) -> list[str]:
@@ -218,13 +298,35 @@ def forked_command() -> Iterator[Callable[..., tuple[int, str, str]]]:
 
 
 @pytest.fixture(scope="session")
-def smoke_variants(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """(name, function of a folder) -> the folder, which the function has made for all workers."""
+    home = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        home = home.parent
+
+    def made(name: str, make: Callable[[Path], object]) -> Path:
+        folder = home / f"once-{name}"
+        with (home / f"once-{name}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not (folder / "made").exists():
+                folder.mkdir()  # an error where another worker has failed to make it
+                make(folder)
+                (folder / "made").touch()
+        return folder
+
+    return made
+
+
+@pytest.fixture(scope="session")
+def smoke_variants(made_once: Callable[..., Path]) -> Path:
     """The folder `variants` of a store, with the variant of `scene=motorcycle preset=smoke`."""
-    store = Store(tmp_path_factory.mktemp("smoke"))
-    conf = composed("scene=motorcycle", "preset=smoke")
-    store.prepare()
-    variant.build(conf.scene, conf.variant, store.variants, store.scenes)
-    return store.variants
+
+    def build(folder: Path) -> None:
+        store, conf = Store(folder / "s"), composed("scene=motorcycle", "preset=smoke")
+        store.prepare()
+        variant.build(conf.scene, conf.variant, store.variants, store.scenes)
+
+    return made_once("smoke", build) / "s" / "variants"
 
 
 @dataclass(frozen=True)

@@ -40,9 +40,12 @@ def unreadable(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
 
 @pytest.fixture
 def disk_events(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """What is synced and renamed from now on, in its order: `sync NAME` and `rename OLD to NEW`."""
+    """What is synced and named from now on, in its order: `sync NAME` and `rename OLD to NEW`.
+
+    A file that is written under a temporary name gets its own by `name NEW`.
+    """
     events: list[str] = []
-    sync, rename = os.fsync, os.rename
+    sync, rename, replace = os.fsync, os.rename, os.replace
 
     def synced(descriptor: int) -> None:
         events.append("sync " + Path(f"/proc/self/fd/{descriptor}").readlink().name)
@@ -52,8 +55,13 @@ def disk_events(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         events.append(f"rename {Path(old).name} to {Path(new).name}")
         rename(old, new, **folders)
 
+    def replaced(old: str, new: str, **folders: int) -> None:
+        events.append(f"name {Path(new).name}")
+        replace(old, new, **folders)
+
     monkeypatch.setattr(os, "fsync", synced)
     monkeypatch.setattr(os, "rename", renamed)
+    monkeypatch.setattr(os, "replace", replaced)
     return events
 
 
@@ -115,9 +123,9 @@ def build_in(small_conf: Callable[..., VariantConf]) -> Callable[..., Variant]:
 
 
 @pytest.fixture(scope="session")
-def shared_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A store for variants that no test changes."""
-    return tmp_path_factory.mktemp("store")
+def shared_store(made_once: Callable[..., Path]) -> Path:
+    """A store for variants that no test changes; all workers have it, and build each once."""
+    return made_once("store", lambda _: None)
 
 
 @pytest.fixture(scope="session")

@@ -58,10 +58,13 @@ def test_an_installation_is_compared_with_itself(tmp_path: Path) -> None:
         assert word in text
 
 
-@pytest.mark.slow
 def test_an_installation_that_cannot_run_is_named_with_its_reason(
-    load: Load, tmp_path: Path
+    load: Load, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    this = tmp_path / "this"
+    this.write_text("#!/bin/sh\nread request\necho '{}'\nexec cat >/dev/null\n")
+    this.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(this))
     python = tmp_path / "python"
     python.write_text("#!/bin/sh\necho 'no torch here' >&2\nexit 3\n")
     python.chmod(0o755)

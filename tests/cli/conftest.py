@@ -143,12 +143,16 @@ def children(monkeypatch: pytest.MonkeyPatch) -> Children:
 
 
 @pytest.fixture(scope="session")
-def swept(forked_command: RunCommand, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+def swept(forked_command: RunCommand, made_once: Callable[..., Path]) -> tuple[Path, str]:
     """A folder with a finished smoke sweep in its store `s`, and what was printed."""
-    folder = tmp_path_factory.mktemp("swept")
-    code, out, err = forked_command("sweep", folder, "+ablation=consistency", *SMOKE, "store=s")
-    assert code == 0, err
-    return folder, out
+
+    def sweep_once(folder: Path) -> None:
+        code, out, err = forked_command("sweep", folder, "+ablation=consistency", *SMOKE, "store=s")
+        assert code == 0, err
+        (folder / "printed").write_text(out, encoding="utf-8")
+
+    folder = made_once("swept", sweep_once)
+    return folder, (folder / "printed").read_text(encoding="utf-8")
 
 
 @pytest.fixture

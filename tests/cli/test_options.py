@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import errno
+import os
 import shutil
 import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import get_args, get_type_hints
@@ -21,14 +23,32 @@ RunCommand = Callable[..., tuple[int, str, str]]
 COMMANDS = ("bench", "data", "render", "report", "status", "store", "train", "view")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("command", ["sweep", *COMMANDS])
-def test_help_answers_at_once(
-    run_command: RunCommand, tmp_path: Path, without_heavy: str, command: str
-) -> None:
-    code, out, err = run_command(command, tmp_path, "--help", PYTHONPATH=without_heavy)
-    assert code == 0, err
-    assert f"xrgs-{command} " in out.splitlines()[0]
+def test_help_answers_at_once(tmp_path: Path, without_heavy: str) -> None:
+    """All commands in one process, in which no module that takes long can be imported."""
+    script = """
+import sys
+from importlib import import_module
+for command in sys.argv[1:]:
+    print(f"of {command}:", flush=True)
+    sys.argv = [f"xrgs-{command}", "--help"]
+    try:
+        import_module(f"xrgs.cli.{command}").main()
+    except SystemExit as end:
+        assert not end.code
+"""
+    commands = ("sweep", *COMMANDS)
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", script, *commands],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": without_heavy},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    for command in commands:
+        _, _, text = done.stdout.partition(f"of {command}:\n")
+        assert f"xrgs-{command} " in text.splitlines()[0]
 
 
 def test_help_has_what_is_said_of_an_option_without_the_breaks_of_its_lines(

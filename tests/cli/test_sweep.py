@@ -192,25 +192,22 @@ def test_each_arm_and_replicate_has_a_control_and_a_count_out_of_reach_fails_one
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("changes", "done"),
-    [
-        (["seed=1"], 0),
-        (["train.steps=9"], 0),
-        (["components.loss_weighting.lr_weight=0.5"], 1),  # the baseline has no component
-        (["threads=1", "data_root=x", "scene.name=y", "store=./s", "checkpoint_s=7"], 2),
-    ],
-)
 def test_a_value_that_changes_a_number_is_another_cell(
-    sweep_here: SweepHere, children: Any, changes: list[str], done: int
+    sweep_here: SweepHere, children: Any
 ) -> None:
     arguments = ("+ablation=consistency", "train.steps=8", *SCENE)
     code, _, err = sweep_here(*arguments)
     assert code == 0, err
-    keys = {change.partition("=")[0] for change in changes}
-    kept = [word for word in arguments if word.partition("=")[0] not in keys]
-    _, _, err = sweep_here(*kept, *changes, "dry_run=true")
-    assert f"plan: 2 cells, {done} done" in err
+    for changes, done in (
+        (["seed=1"], 0),
+        (["train.steps=9"], 0),
+        (["components.loss_weighting.lr_weight=0.5"], 1),  # the baseline has no component
+        (["threads=1", "data_root=x", "scene.name=y", "store=./s", "checkpoint_s=7"], 2),
+    ):
+        keys = {change.partition("=")[0] for change in changes}
+        kept = [word for word in arguments if word.partition("=")[0] not in keys]
+        _, _, err = sweep_here(*kept, *changes, "dry_run=true")
+        assert f"plan: 2 cells, {done} done" in err
 
 
 @pytest.mark.slow
@@ -286,9 +283,8 @@ def test_bad_input_is_named(
     (tmp_path / "empty").mkdir()
     (tmp_path / "in-the-way").write_text("a file")
     photographs(tmp_path / "one", 1)
-    code, out, err = sweep_here("preset=smoke", *arguments)
-    if arguments[0].startswith("rerun="):
-        code, out, err = sweep_here(*arguments)
+    preset = [] if arguments[0].startswith("rerun=") else ["preset=smoke"]
+    code, out, err = sweep_here(*preset, *arguments)
     assert code == 1
     for text in named:
         assert text in out + err

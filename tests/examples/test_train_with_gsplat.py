@@ -15,7 +15,6 @@ from types import ModuleType
 import numpy as np
 import pytest
 import torch
-from kornia.losses import SSIMLoss
 from PIL import Image
 
 from tests import reference_store as reference
@@ -25,6 +24,8 @@ from xrgs.formats.gsplat_api import rasterization
 
 
 def test_ssim_is_kornias_over_the_windows_inside(script: Callable[[str], ModuleType]) -> None:
+    from kornia.losses import SSIMLoss
+
     random = torch.Generator().manual_seed(0)
     first, second = torch.rand(2, 29, 41, 3, generator=random)
     second = 0.7 * first + 0.3 * second

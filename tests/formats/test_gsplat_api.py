@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import Any, NamedTuple
 
 import gsplat
@@ -162,6 +163,17 @@ def tracked(scene: Scene) -> Scene:
     return scene._replace(**{n: getattr(scene, n).detach().requires_grad_() for n in names})
 
 
+@cache
+def expected_of(
+    dtype: torch.dtype, mode: RenderMode, antialiased: bool, sh_degree: int | None, per_camera: bool
+) -> tuple[Tensor, Tensor, list[Tensor]]:
+    """Image, alpha and gradients of `reference` of the scene in numbers of a type, in float64."""
+    made = scene(per_camera=per_camera, sh_degree=None if sh_degree is None else 3)
+    theirs = tracked(made.to(dtype).to(torch.float64))
+    image, alpha, _ = reference(theirs, mode, sh_degree=sh_degree, antialiased=antialiased)
+    return image.detach(), alpha.detach(), gradients(theirs, image, alpha)
+
+
 @pytest.mark.parametrize(
     ("mode", "antialiased", "sh_degree", "per_camera"),
     [
@@ -173,9 +185,8 @@ def test_images_alphas_and_gradients_are_gsplats(
     backend: str, mode: RenderMode, antialiased: bool, sh_degree: int | None, per_camera: bool
 ) -> None:
     made = scene(per_camera=per_camera, sh_degree=None if sh_degree is None else 3)
-    if backend == "native":
-        made = made.to(torch.float32)
-    ours, theirs = tracked(made), tracked(made.to(torch.float64))
+    dtype = torch.float32 if backend == "native" else torch.float64
+    ours = tracked(made.to(dtype))
     colors, alphas, _ = rasterization(
         **ours.arguments(),
         sh_degree=sh_degree,
@@ -183,11 +194,10 @@ def test_images_alphas_and_gradients_are_gsplats(
         rasterize_mode="antialiased" if antialiased else "classic",
         backend=backend,
     )
-    expected = reference(theirs, mode, sh_degree=sh_degree, antialiased=antialiased)[:2]
+    *expected, true_gradients = expected_of(dtype, mode, antialiased, sh_degree, per_camera)
     relative, absolute = (2e-5, 2e-5) if backend == "native" else (0, 1e-10)
     for mine, true in zip((colors, alphas), expected, strict=True):
         torch.testing.assert_close(mine, true.to(mine.dtype), rtol=relative, atol=absolute)
-    true_gradients = gradients(theirs, *expected)
     for mine, true in zip(gradients(ours, colors, alphas), true_gradients, strict=True):
         if backend == "native":
             assert (mine - true).norm() <= 1e-4 * true.norm()

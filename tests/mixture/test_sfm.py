@@ -81,7 +81,7 @@ def test_the_stereo_pair_is_registered_with_its_known_intrinsics(stereo_pair: St
         assert model.lenses[i].is_pinhole
 
 
-@pytest.mark.parametrize(("focal", "expected"), [(995.0, 995.0), (None, 1.2 * 741)])
+@pytest.mark.parametrize(("focal", "expected"), [(497.5, 497.5), (None, 1.2 * 370)])
 def test_two_views_keep_the_focal_length_that_exif_gives(
     sfm_conf: SfmConf,
     stereo_scene: SceneConf,
@@ -89,11 +89,11 @@ def test_two_views_keep_the_focal_length_that_exif_gives(
     focal: float | None,
     expected: float,
 ) -> None:
-    """From two views it can't be told apart from the depth."""
+    """From two views it can't be told apart from the depth. They are half the pair's size."""
     scene = scenes.resolve(stereo_scene, tmp_path)
     inputs = []
     for file in scene.files.values():
-        images.save(tmp_path / file.name, images.read(file))
+        images.save(tmp_path / file.name, images.resize(images.read(file), 370, 250))
         inputs.append(sfm.SfmImage(file.name, file.stem, "all", None, focal))
     model = sfm.reconstruct(inputs, tmp_path, tmp_path, sfm_conf)
     assert [lens.params[0] for lens in model.lenses.values()] == pytest.approx([expected] * 2)

@@ -54,7 +54,7 @@ def test_a_variant_is_built_once_whatever_the_scenes_label(
     again = variant.build(scene, conf, shared_store / "variants", shared_store / "scenes")
     assert again.id == stereo_variant.id
     assert (stereo_variant.folder / "variant.json").stat().st_mtime_ns == written
-    assert not list((shared_store / "variants").glob(".*.building"))
+    assert not list((shared_store / "variants").glob(f".{again.id.partition('-')[0]}.building"))
 
 
 def test_the_key_follows_photographs_and_config(
@@ -79,7 +79,7 @@ def test_the_key_follows_photographs_and_config(
     assert variant.find(stereo_variant.folder.parent, "0" * 16) is None
 
 
-def test_a_corrupt_variant_is_built_anew_with_a_warning(
+def test_a_corrupt_variant_is_built_anew_with_a_warning_and_what_a_kill_left_is_removed(
     stereo_variant: Variant,
     stereo_scene: SceneConf,
     small_conf: Conf,
@@ -98,10 +98,14 @@ def test_a_corrupt_variant_is_built_anew_with_a_warning(
     key = variant.key(stereo_scene, small_conf(stereo_scene))
     assert variant.find(store / "variants", key) is None
     assert "built anew" in caplog.text
+    leftover = store / "variants" / f".{key}.building" / "frozen"
+    leftover.mkdir(parents=True)
+    (leftover / "variant.json").write_text("half")
     rebuilt = build(stereo_scene)
     aside = store / "variants" / f".{copy.name}.aside-1"
     assert f"renamed to {aside.name}" in caplog.text
     assert (aside / target.relative_to(copy)).read_bytes() == damaged, "nothing is lost"
+    assert not leftover.parent.exists()
     found = variant.find(store / "variants", key)
     assert found is not None
     assert found.id == rebuilt.id
@@ -134,17 +138,6 @@ def test_a_failure_is_forgotten_where_its_report_is_damaged(tmp_path: Path) -> N
     assert variant.failure(tmp_path, "key") == "too few"
     report.write_text("{")
     assert variant.failure(tmp_path, "key") is None
-
-
-def test_what_a_killed_process_left_is_removed(
-    store: Path, stereo_scene: SceneConf, small_conf: Conf, build: Build
-) -> None:
-    key = variant.key(stereo_scene, small_conf(stereo_scene))
-    leftover = store / "variants" / f".{key}.building" / "frozen"
-    leftover.mkdir(parents=True)
-    (leftover / "variant.json").write_text("half")
-    build(stereo_scene)
-    assert not leftover.parent.exists()
 
 
 def test_two_processes_at_once_share_one_variant(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import pytest
 import torch
 from scipy.ndimage import gaussian_filter
@@ -76,6 +78,17 @@ def blurred(image: Tensor, size: tuple[int, int], variances: Tensor) -> Tensor:
     return torchs(image, size)
 
 
+@cache
+def blur_and_gradients(
+    old: tuple[int, int], new: tuple[int, int], variances: tuple[float, float]
+) -> tuple[Tensor, tuple[Tensor, ...]]:
+    """`blurred` noise, and the gradients by the image and by the variances, in double."""
+    image, slope = noise(*old).requires_grad_(), noise(*new, seed=1) - 0.5
+    exact = torch.tensor(variances).double().requires_grad_()
+    expected = blurred(image, new, exact)
+    return expected.detach(), torch.autograd.grad(expected, (image, exact), slope)
+
+
 #: Variances down and across, px^2: none, far below 1, a few px, and beyond a small image's borders.
 VARIANCES = [(0.0, 0.0), (1e-3, 0.1), (2.9, 18.0), (300.0, 0.5)]
 
@@ -86,19 +99,16 @@ def test_a_blur_of_a_variance_is_the_exponential_of_the_second_difference(
     backend: str, old: tuple[int, int], new: tuple[int, int], variances: tuple[float, float]
 ) -> None:
     """Its value, and its gradients by the image and by the variances."""
-    image, slope, exact = noise(*old), noise(*new, seed=1) - 0.5, torch.tensor(variances).double()
+    image, slope = noise(*old), noise(*new, seed=1) - 0.5
     kind = torch.float32 if backend == "native" else torch.float64
-    leaves = image.to(kind).requires_grad_(), exact.clone().requires_grad_()
+    exact = torch.tensor(variances).double()
+    leaves = image.to(kind).requires_grad_(), exact.requires_grad_()
     found = resize(leaves[0], *new, variances=leaves[1], backend=backend)
-    image.requires_grad_()
-    exact.requires_grad_()
-    expected = blurred(image, new, exact)
+    expected, true_gradients = blur_and_gradients(old, new, variances)
     tolerance = 2e-6 if backend == "native" else 1e-11
     torch.testing.assert_close(found.double(), expected, rtol=0, atol=tolerance)
     gradients = torch.autograd.grad(found, leaves, slope.to(kind))
-    for value, truth in zip(
-        gradients, torch.autograd.grad(expected, (image, exact), slope), strict=True
-    ):
+    for value, truth in zip(gradients, true_gradients, strict=True):
         scale = slope.abs().sum().item() if truth.shape == (2,) else truth.abs().max().item()
         torch.testing.assert_close(value.double(), truth, rtol=0, atol=tolerance * scale)
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 import torch
@@ -60,7 +62,8 @@ def test_a_function_has_torchs_own_defaults_and_the_callers_are_restored(*, fail
 
 
 @pytest.mark.slow
-def test_the_public_functions_work(tmp_path: object) -> None:
+def test_the_public_functions_work(tmp_path: Path, smoke_variants: Path) -> None:
+    shutil.copytree(smoke_variants, tmp_path / "s" / "variants")
     run = [sys.executable, "-P", "-c", PROGRAM, str(tmp_path)]
     done = subprocess.run(run, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

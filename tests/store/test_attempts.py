@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import shutil
 from pathlib import Path
 
@@ -39,6 +40,34 @@ def test_beginning_a_stopped_cell_keeps_its_checkpoint_and_no_result(
     assert (stopped.path / "log.txt").read_text() == "begun\n"
     assert stopped.config().store == "elsewhere"
     assert list_names(stopped.path.parent) == ["abc"]
+
+
+def steps(events: list[str]) -> list[str]:
+    """Events of the disk without the random ends of hidden names."""
+    return [re.sub(r"(\.(?:new|old))-\w+", r"\1", event) for event in events]
+
+
+def test_a_new_attempt_is_on_the_disk_before_it_has_the_name_of_the_old_one(
+    stopped: CellFolder, disk_events: list[str]
+) -> None:
+    """A power failure leaves the old one or the new one, whole, and no removed one as a third."""
+    assert begin_attempt(stopped)
+    events = steps(disk_events)
+    named = events.index("rename abc to .abc.old")
+    files = ("checkpoint.npz", "config.json", "identity.json", "log.txt", ".abc.new")
+    assert sorted(events[:named]) == sorted(f"sync {name}" for name in files)
+    assert events[named:] == [
+        *("rename abc to .abc.old", "sync cells", "rename .abc.new to abc", "sync cells"),
+        *("rename .abc.old to .abc.new", "sync cells"),
+    ]
+
+
+def test_what_is_set_aside_keeps_its_name_on_the_disk(
+    done: CellFolder, disk_events: list[str]
+) -> None:
+    (done.path / "scores.csv").write_text("view\n")
+    assert begin_attempt(done)
+    assert steps(disk_events)[-2:] == ["rename .abc.old to abc.aside-1", "sync cells"]
 
 
 def test_a_cell_killed_before_its_first_checkpoint_leaves_no_folder_aside(tmp_path: Path) -> None:

@@ -6,9 +6,6 @@ import logging
 import random
 import shutil
 import signal
-import subprocess
-import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,17 +18,14 @@ from tests.store.cells import begun
 from xrgs.config import Conf
 from xrgs.evaluation import protocol
 from xrgs.evaluation.metrics import VIEW_METRICS
-from xrgs.mixture import variant
 from xrgs.mixture.views import Variant
 from xrgs.runtime import progress
 from xrgs.runtime.signals import StopRequest, StopSignal
-from xrgs.safeio.atomic import write_json
 from xrgs.safeio.records import read_table
 from xrgs.splat.backend import resolve_backend
 from xrgs.store import cell
 from xrgs.store.cell_folder import CellFolder
 from xrgs.store.identity import cell_id, cell_identity
-from xrgs.sweep import job
 from xrgs.training import dataset
 from xrgs.training import loop as train
 from xrgs.training.dataset import Dataset
@@ -195,37 +189,6 @@ def test_an_unusable_checkpoint_is_logged_and_training_starts_over(
     assert message in caplog.text
     assert (folder.path / "refused-checkpoint.npz").exists()
     assert results(folder) == whole(conf, tmp_path / "b")
-
-
-@pytest.mark.slow
-def test_a_worker_that_is_killed_goes_on_in_another(
-    compose: Callable[..., Conf], smoke_variants: Path, tmp_path: Path
-) -> None:
-    changes = ("scene=motorcycle", "preset=smoke", "train.steps=120", "threads=1")
-    conf = compose(*changes, "checkpoint_s=0.05")
-    conf.splat.backend = resolve_backend(conf.splat.backend)
-    (frozen,) = smoke_variants.iterdir()
-    built = variant.load(frozen)
-
-    folder = begin(conf, tmp_path / "killed", built.id)
-    write_json(tmp_path / "request.json", job.cell_request(built.folder, folder))
-    files = [str(tmp_path / "request.json"), str(tmp_path / "answer.json")]
-    child = subprocess.Popen([sys.executable, "-P", "-m", "xrgs.sweep.job", "cell", *files])
-    while not folder.checkpoint.exists() and child.poll() is None:
-        time.sleep(0.005)
-    time.sleep(random.uniform(0, 0.1))
-    child.kill()
-    assert child.wait() == -9
-    folder.fail("its process was ended by SIGKILL")  # as the job does that started it
-
-    folder = begin(conf, tmp_path / "killed", built.id)
-    job.run_in_child("cell", job.cell_request(built.folder, folder))
-    log = (folder.path / "log.txt").read_text()
-    assert "going on from the checkpoint" in log
-    spared = begin(conf, tmp_path / "spared", built.id)
-    cell.run_cell(conf, built, spared)
-    assert results(folder) == results(spared)
-    assert folder.status().files.keys() == spared.status().files.keys()
 
 
 def test_the_test_views_are_scored_during_training_and_nothing_else_changes(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 
 from tests.store.cells import SCORES, SUMMARY, identity
@@ -21,6 +23,31 @@ def test_a_finished_cell_is_done_and_gives_back_what_was_written(done: CellFolde
 def test_declaring_a_cell_done_twice_keeps_it_done(done: CellFolder) -> None:
     done.finish(["a", "b"], {})
     assert done.state().name == "done"
+
+
+def test_every_result_is_on_the_disk_before_a_cell_is_done(
+    done: CellFolder, disk_events: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And the checkpoint is removed after that: a power failure costs no step."""
+    results = {f"sync {path.name}" for path in done.path.rglob("*")} - {"sync status.json"}
+    done.status_file.unlink()
+    monkeypatch.setattr(CellFolder, "drop_checkpoint", lambda _: disk_events.append("drop"))
+    done.finish(["a", "b"], {})
+    named = disk_events.index("name status.json")
+    assert results | {f"sync {done.id}"} <= set(disk_events[: named - 1])
+    assert disk_events[named - 1].startswith("sync .status.json.")
+    assert disk_events[named + 1 :] == [f"sync {done.id}", "drop"]
+
+
+def test_the_reason_is_on_the_disk_before_a_cell_has_failed(
+    done: CellFolder, disk_events: list[str]
+) -> None:
+    done.fail("out of luck")
+    assert [re.sub(r"\.\d+-\w+$", "", event) for event in disk_events] == [
+        *("sync .error.txt", "name error.txt", "sync abc"),
+        *("sync .status.json", "name status.json", "sync abc"),
+    ]
+    assert done.state().reason == "out of luck"
 
 
 def test_a_cell_without_status_is_unfinished_planned_or_absent(done: CellFolder) -> None:

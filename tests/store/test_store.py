@@ -28,6 +28,16 @@ def test_the_same_comparison_has_the_same_sweep_id(tmp_path: Path) -> None:
     assert store.sweep_record().cells == (row("y"),)
 
 
+def test_a_store_and_its_records_are_on_the_disk(tmp_path: Path, disk_events: list[str]) -> None:
+    store = Store(tmp_path)
+    store.prepare()
+    assert disk_events == [f"sync {tmp_path.name}"]
+    sweep = store.write_sweep(["a=1"], [row("x")])
+    content, *named = disk_events[1:]
+    assert content.startswith(f"sync .{sweep}.json.")
+    assert named == [f"name {sweep}.json", "sync sweeps"]
+
+
 def test_a_store_without_sweeps_says_so(tmp_path: Path) -> None:
     store = Store(tmp_path)
     store.prepare()

@@ -18,12 +18,15 @@ SMOKE = ("scene=motorcycle", "preset=smoke", "train.steps=4", "seed=0,1")
 #: Folder of Ray's files; the paths of its sockets may have at most 107 bytes.
 RAY = Path(tempfile.gettempdir(), "xrgs-ray")
 #: Python loads this in every process of a sweep: each sees two cores, and a cell's process waits
-#: until another cell has begun; if the file `kill` exists, one then kills the launcher's worker.
+#: until another cell has begun; if the file `kill` exists, one then kills the launcher's worker. No
+#: report is made: it takes seconds, and is the same however its cells were launched.
 SITE = """
-import os, sys, time
+import os, sys, time, types
 from pathlib import Path
 
 os.sched_getaffinity = lambda pid: {0, 1}
+sys.modules["xrgs.report"] = types.ModuleType("xrgs.report")
+sys.modules["xrgs.report"].build = lambda *_: types.SimpleNamespace(text="")
 if "xrgs.sweep.job" in sys.orig_argv and "cell" in sys.orig_argv:
     folder = Path(os.environ["SWEEPS_OF"])
     end = time.monotonic() + 90

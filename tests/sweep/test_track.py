@@ -15,8 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from mlflow import MlflowClient
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from xrgs.errors import XrgsError
 from xrgs.store.cell_folder import CellFolder, CellState
@@ -101,7 +99,12 @@ def in_tables(folder: Path, cell_id: str) -> Series:
     return found
 
 
+# The readers are imported where they are used: each takes a second or more in every worker.
+
+
 def in_tensorboard(folder: Path, cell_id: str) -> Series:
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
     (run,) = folder.glob(f"*--{cell_id}")
     events = EventAccumulator(str(run)).Reload()
     plugin = events.summary_metadata["_hparams_/session_start_info"].plugin_data.content
@@ -113,6 +116,8 @@ def in_tensorboard(folder: Path, cell_id: str) -> Series:
 
 
 def in_mlflow(folder: Path, cell_id: str) -> Series:
+    from mlflow import MlflowClient
+
     client = MlflowClient(f"sqlite:///{folder}/mlflow.db")
     (experiment,) = [e for e in client.search_experiments() if e.name == "xrgs"]
     found = client.search_runs([experiment.experiment_id], f"tags.cell_id = '{cell_id}'")
@@ -231,6 +236,8 @@ def test_a_record_that_a_kill_cut_off_is_written_again(swept: Swept) -> None:
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # MLflow's own, of SQLAlchemy 2.1
 def test_mlflow_shows_how_a_cell_ended(swept: Swept) -> None:
+    from mlflow import MlflowClient
+
     names = ("done", "failed", "stopped")
     cells = {name: swept.begin(name) for name in names}
     for cell in cells.values():

@@ -84,9 +84,7 @@ def wait_for(what: Callable[[], object], sweep: Any) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("vanishes", "launcher"), [(rename, "basic"), (unmount, "basic"), (delete, "joblib")]
-)
+@pytest.mark.parametrize(("vanishes", "launcher"), [(unmount, "basic"), (delete, "joblib")])
 def test_a_sweep_whose_store_vanishes_ends_in_order(
     sweeps_in: Callable[..., Any],
     smoke_variants: Path,

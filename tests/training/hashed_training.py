@@ -1,8 +1,8 @@
 """A short training on the native backend, and the SHA-256 of all that it computes.
 
 A program, because `XRGS_ISA` and `ATEN_CPU_CAPABILITY` are read when a process starts. Its
-arguments are a strategy of densification and numbers of threads; it prints a line with the hash for
-each number.
+arguments are numbers of threads. For each strategy of densification and each number it prints a
+line with the strategy and the hash.
 """
 
 from __future__ import annotations
@@ -114,6 +114,7 @@ def _smooth(image: Tensor) -> Tensor:
 
 
 if __name__ == "__main__":
-    for threads in sys.argv[2:]:
-        torch.set_num_threads(int(threads))
-        sys.stdout.write(f"{training_hash(sys.argv[1])}\n")
+    for strategy in _CASES:
+        for threads in sys.argv[1:]:
+            torch.set_num_threads(int(threads))
+            sys.stdout.write(f"{strategy} {training_hash(strategy)}\n")

@@ -160,10 +160,11 @@ def test_a_killed_run_ends_as_one_never_killed(
     total = losses.count
     assert (total > STEPS) == (case == "count_matched")  # which takes more than one attempt
 
-    # hypothesis begins with the smallest kill there is, so two at random come first; on the torch
-    # backend, whose steps take ten times as long, they are the only ones.
+    # hypothesis begins with the smallest kill there is, so two at random come first; they are the
+    # only ones of most cases.
     at_random = [random.randrange(total // 4, total), random.randrange(1, total)]
-    phases = [Phase.explicit] if backend == "torch" else [Phase.explicit, Phase.generate]
+    few = backend == "torch" or case not in FAST
+    phases = [Phase.explicit] if few else [Phase.explicit, Phase.generate]
 
     @settings(max_examples=2, phases=phases)
     @example(kills=at_random, every=random.randint(1, 9))

