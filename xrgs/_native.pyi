@@ -87,8 +87,8 @@ class Frame:
         self, config: RenderConfig, *inputs: Tensor | int | None
     ) -> tuple[Tensor, Tensor]: ...
     # The inputs are the gradients of image and alpha, the six parameters, means2d_offset or None,
-    # whether the gradient of shN is needed, and the number of threads. The last result is whether all
-    # gradients are finite.
+    # whether the gradient of shN is needed, and the number of threads. The last result is whether
+    # all gradients are finite.
     def backward(self, *inputs: Tensor | int | None) -> tuple[*tuple[Tensor | None, ...], bool]: ...
     def visible(self) -> Tensor: ...
     @property
