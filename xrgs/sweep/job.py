@@ -370,7 +370,7 @@ def restore_images(conf: Conf, store: Store, variant_id: str) -> None:
         return
     log_line(f"variant {variant_id}: making the images again that xrgs-store trim has removed")
     request = {"conf": asdict(conf), "store": str(store.path), "variant": variant_id}
-    run_in_child("restore", request, on_poll=lambda _: store.check_not_gone())
+    run_in_child("restore", request, _NO_LIMITS, lambda _: store.check_not_gone())
 
 
 def run_in_child(
