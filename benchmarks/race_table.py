@@ -197,7 +197,8 @@ def notes(runs: Sequence[Run]) -> list[str]:
     ]
     if not any(run.arm.startswith("opensplat") for run in runs):
         lines.append("- OpenSplat was not run.")
-    others = max(run.others for run in runs)
+    counted = [run for budget in budgets(runs) for run in chosen(runs, *budget).values()]
+    others = max((run.others for run in counted), default=0.0)
     if others > QUIET:
         lines.append(f"- **No result:** other programs used up to {others:.1f} cores meanwhile.")
     return lines
@@ -217,14 +218,15 @@ def figure(runs: Sequence[Run]) -> Figure:
 
 
 def _draw(axes: Axes, runs: Sequence[Run], size: int, score: str) -> None:
-    times = [minutes for at, minutes in budgets(runs) if at == size]
-    means: dict[str, list[tuple[float, float]]] = {}
-    for minutes in times:
-        longest = chosen(runs, size, minutes)
-        for arm in dict.fromkeys(arm for arm, _ in longest):
-            values = [getattr(run, score) for (name, _), run in longest.items() if name == arm]
-            means.setdefault(arm, []).append((minutes, fmean(values)))
-    for (arm, points), mark in zip(sorted(means.items()), itertools.cycle(_MARKS)):
-        axes.plot(*zip(*points, strict=True), marker=mark, label=arm)
-    axes.set(xscale="log", xticks=times, xticklabels=[f"{minutes:g}" for minutes in times])
-    axes.minorticks_off()
+    """Draw every run of a size, also those that only helped to plan others: a line a scene."""
+    arms = dict.fromkeys(run.arm for run in runs if run.size == size)
+    for (number, arm), mark in zip(enumerate(arms), itertools.cycle(_MARKS)):
+        arm_runs = sorted(
+            (run for run in runs if (run.size, run.arm) == (size, arm)),
+            key=lambda run: (run.scene, run.seconds),
+        )
+        for scene, scene_runs in itertools.groupby(arm_runs, key=lambda run: run.scene):
+            points = [(run.seconds / 60, getattr(run, score)) for run in scene_runs]
+            label = arm if scene == arm_runs[0].scene else None
+            axes.plot(*zip(*points, strict=True), f"C{number}", marker=mark, ms=4, label=label)
+    axes.set_xlim(left=0)
