@@ -386,8 +386,8 @@ def _stale_warning(sweep: Sweep) -> list[str]:
     if stale.empty:
         return []
     names = {name for text in stale["stale"] for name in text.split()}
-    always = [m for m in METRICS if m.score and not m.optional]
-    scores = [m.label for m in always if names & {m.name, PROTOCOL}]
+    always = set() if PROTOCOL not in names else {m.name for m in METRICS if not m.optional}
+    scores = [m.label for m in METRICS if m.score and m.name in names | always]
     return [
         f"The scores of {counted(len(stale), 'cell')} are missing or of other code than is"
         f" installed ({', '.join(scores)}): xrgs-store rescore computes them. A score is compared"
