@@ -417,6 +417,12 @@ def test_a_new_protocol_makes_every_score_stale(made: Any) -> None:
     assert said in build(made.store.path, pictures=[]).text
 
 
+def test_a_stale_score_that_is_taken_on_request_is_named(made: Any) -> None:
+    made.add(scored_by={"lpips_vgg": "old"})
+    made.write()
+    assert "installed (LPIPS (VGG)):" in build(made.store.path, pictures=[]).text
+
+
 def test_cells_csv_has_steps_size_and_factor(made: Any) -> None:
     configured(made.add(summary={"steps": 700}), variant={"long_side": 250, "factor": 3})
     made.add("consistency")  # of another version of xrgs, as its config can't be read

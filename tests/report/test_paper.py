@@ -1,14 +1,12 @@
 """The paper's tables, its claim on texture and its figures beside a sweep's own results."""
 
 import csv
-import math
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 from scipy.stats import spearmanr
 
@@ -17,9 +15,9 @@ from xrgs.report.compare import compare
 from xrgs.report.context import Context
 from xrgs.report.joined import ReportStore
 from xrgs.report.page import build
-from xrgs.report.paper import paper_tables, texture, texture_tables, why_no_table, with_texture
+from xrgs.report.paper import paper_tables, texture_tables, why_no_table, with_texture
 from xrgs.runtime.text import TextTable
-from xrgs.training.components.texture import gradient_magnitude
+from xrgs.store.trimming import trim_variant
 
 SCENES = ("fern", "flower", "horns")
 
@@ -128,21 +126,6 @@ BY_TEXTURE = ("room", "fern", "trex")  # from the flattest to the most textured,
 TEXTURE_CONTEXTS = {"": Context(("500 steps",), ("a machine",))}
 
 
-def test_texture_is_the_mean_of_the_gradient_that_components_use() -> None:
-    image = np.random.default_rng(0).uniform(size=(37, 53, 3)).astype(np.float32)
-    magnitude = gradient_magnitude(torch.from_numpy(image).double())[:-1, :-1]
-    assert texture(image) == pytest.approx(float(magnitude.mean()), rel=1e-12)
-
-
-def test_texture_of_a_ramp_is_its_slope() -> None:
-    ramp = np.broadcast_to(np.linspace(0, 1, 11, dtype=np.float32)[None, :, None], (7, 11, 3))
-    assert texture(ramp) == pytest.approx(0.1, rel=1e-6)
-
-
-def test_an_image_one_pixel_wide_has_no_texture() -> None:
-    assert math.isnan(texture(np.zeros((9, 1, 3), np.float32)))
-
-
 def draw(made: Any, scene: str, amplitude: int) -> None:
     """Give both scored photographs of a scene stripes of this amplitude, in steps of 1 / 255."""
     for view in ("IMG_001", "IMG_009"):
@@ -177,6 +160,15 @@ def test_scenes_are_in_the_order_of_their_texture(made: Any) -> None:
     assert rows["a", "PSNR, dB"] == ("+1.00 ↑", "+2.00 ↑", "+3.00 ↑", "+1.00")
     assert rows["a", "LPIPS, %"] == ("0.00 =", "0.00 =", "0.00 =", "")
     assert {metric for _, metric in rows} == {"LPIPS, %", "SSIM, %", "PSNR, dB"}
+
+
+def test_the_table_stays_where_the_photographs_were_removed(made: Any) -> None:
+    add_scenes(made)
+    before = tables_by_texture(made)
+    for row in made.rows:
+        trim_variant(made.store.variants, row["variant_id"])
+    assert not list(made.store.variants.rglob("*.png"))
+    assert tables_by_texture(made) == before
 
 
 def test_the_table_says_how_its_scores_were_made(made: Any) -> None:

@@ -20,6 +20,8 @@ from xrgs.store.store import Store
 
 HEAVY = ("renders/a.png", "renders/b.png", "splats.ply")
 BYTES = 20
+#: The files of a trimmed variant.
+KEPT = ["points.npz", "report.json", "textures.json", "variant.json"]
 
 
 @pytest.fixture
@@ -104,7 +106,7 @@ def test_a_trimmed_variant_keeps_its_list_and_is_found_by_its_key(variants: Path
     trimming.trim_variant(variants, name)
     assert list_names(variants) == [f"trimmed-{name}"]
     folder = variants / f"trimmed-{name}"
-    assert list_names(folder) == ["points.npz", "report.json", "variant.json"]
+    assert list_names(folder) == KEPT
     assert trimming.verify_variant(folder) == []
     assert trimming.trimmed_variant(variants, "key") == name
     assert trimming.image_bytes(variants, name) == 0
@@ -180,18 +182,10 @@ def test_images_that_cant_be_made_again_leave_the_variant_trimmed(
     with pytest.raises(StoreError, match=rf"variant {trimmed}: .* made again: another image\. Rem"):
         again(trimmed, StoreError("another image"))
     assert names(variants) == [f"trimmed-{trimmed}"]
-    assert list_names(variants / f"trimmed-{trimmed}") == [
-        "points.npz",
-        "report.json",
-        "variant.json",
-    ]
+    assert list_names(variants / f"trimmed-{trimmed}") == KEPT
     with pytest.raises(UnreadableError, match="a server is away"):
         again(trimmed, UnreadableError("a server is away"))
-    assert list_names(variants / f"trimmed-{trimmed}") == [
-        "points.npz",
-        "report.json",
-        "variant.json",
-    ]
+    assert list_names(variants / f"trimmed-{trimmed}") == KEPT
 
 
 def test_a_restoration_that_was_killed_midway_is_begun_again(

@@ -28,13 +28,13 @@ from xrgs.mixture import variant
 from xrgs.mixture.views import Variant, View
 from xrgs.photos import images
 from xrgs.photos.scenes import procedural, raycast, still_life
-from xrgs.report.paper import texture
 from xrgs.splat.attribution import attribute_pixels
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import from_points
 from xrgs.splat.loss import photometric_loss, prepare_target
 from xrgs.splat.rendering import rasterize_parameters
 from xrgs.splat.strategy.default import DefaultStrategy
+from xrgs.store.texture import texture
 from xrgs.training import dataset
 from xrgs.training.components import Step
 from xrgs.training.components.mip import sampling_rates

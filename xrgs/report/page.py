@@ -385,8 +385,8 @@ def _stale_warning(sweep: Sweep) -> list[str]:
     if stale.empty:
         return []
     names = {name for text in stale["stale"] for name in text.split()}
-    always = [m for m in METRICS if m.score and not m.optional]
-    scores = [m.label for m in always if names & {m.name, PROTOCOL}]
+    always = set() if PROTOCOL not in names else {m.name for m in METRICS if not m.optional}
+    scores = [m.label for m in METRICS if m.score and m.name in names | always]
     return [
         f"Scores of {counted(len(stale), 'cell')} are missing, or other code than the installed has"
         f" computed them ({', '.join(scores)}): xrgs-store rescore computes them. A score is"

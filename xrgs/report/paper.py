@@ -1,9 +1,4 @@
-"""The paper's claims beside a sweep's own results: Tables 1 and 2, section 7.2, and the figures.
-
-Section 7.2 finds XR-GS better on textured scenes and the baseline better on simple ones, and does
-not say how texture is measured. Here it is the mean magnitude of the gradient of the scored
-photographs, which `xrgs.training.components.texture` defines [xrgs, section 7].
-"""
+"""The paper's claims beside a sweep's own results: Tables 1 and 2, section 7.2, and the figures."""
 
 from __future__ import annotations
 
@@ -14,9 +9,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from xrgs.errors import StoreError, UnreadableError
-from xrgs.photos import images
-from xrgs.photos.images import ImageError
 from xrgs.report.averages import averaged
 from xrgs.report.compare import is_ratio
 from xrgs.report.context import context_of
@@ -35,12 +27,10 @@ from xrgs.runtime.progress import progress
 from xrgs.runtime.text import TextTable, listed
 from xrgs.safeio.sanitize import counted
 from xrgs.store.store import BASELINE
-from xrgs.store.trimming import check_images
+from xrgs.store.texture import texture_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
-
-    from numpy.typing import NDArray
 
     from xrgs.evaluation.metrics import Metric
     from xrgs.report.compare import Comparison
@@ -242,53 +232,19 @@ def with_texture(store: ReportStore, cells: pd.DataFrame, views: pd.DataFrame) -
         views: `Sweep.views`.
 
     Returns:
-        The views with a column `texture`, in intensity (0..1) per px of the photograph; NaN if the
-        photograph was trimmed or can't be read.
+        The views, with `texture` in intensity per px of the photograph. It is NaN where the
+        photograph can't be read, or was removed by a version that did not keep its texture.
     """
     scored = cells.drop_duplicates("cell_id").set_index("cell_id")[["variant_id", "validation"]]
     rows = views.join(scored, on="cell_id")
     rows["split"] = np.where(rows["validation"] > 0, "train", "test")
     photographs = rows[_PHOTOGRAPH].drop_duplicates()
     bar = progress(photographs.to_numpy(), "reading photographs", "photograph", len(photographs))
-    photographs["texture"] = [_texture_of(store, *photograph) for photograph in bar]
-    textures = rows.merge(photographs, on=_PHOTOGRAPH, how="left")["texture"]
-    return views.assign(texture=textures.to_numpy(np.float64))
-
-
-def _texture_of(store: ReportStore, variant_id: str, split: str, view: str) -> float:
-    """Return the texture of one photograph; NaN if it can't be read."""
-    try:
-        variant = store.variant(variant_id)
-        check_images(variant.parent, variant.name)
-        image = images.read_png(variant / "images" / split / f"{view}.png")
-        file = variant / "images" / f"{split}-masks" / f"{view}.png"
-        size = image.shape[1], image.shape[0]
-        return texture(image, images.read_mask(file, size) if file.exists() else None)
-    except (ImageError, StoreError, UnreadableError):
-        return math.nan
-
-
-def texture(image: NDArray[np.float32], mask: NDArray[np.bool_] | None = None) -> float:
-    """Return the mean magnitude of an image's gradient, in intensity (0..1) per px.
-
-    It is `xrgs.training.components.texture.mean_gradient` without torch, and without the last row
-    and column, which are repeated there.
-
-    Args:
-        image: [H, W, 3] in 0..1.
-        mask: [H, W], True for a pixel that is used; None uses all.
-
-    Returns:
-        The mean over the used pixels, at most sqrt(2); NaN if there is none.
-    """
-    if min(image.shape[:2]) < 2:
-        return math.nan
-    inner = image[:-1, :-1].astype(np.float64)
-    squared = (image[:-1, 1:] - inner) ** 2 + (image[1:, :-1] - inner) ** 2
-    magnitude = np.sqrt(squared.mean(axis=2))
-    if mask is not None:
-        magnitude = magnitude[mask[:-1, :-1] & mask[:-1, 1:] & mask[1:, :-1]]
-    return float(magnitude.mean()) if magnitude.size else math.nan
+    photographs["texture"] = [
+        texture_of(store.variant(variant_id), f"{split}/{view}") for variant_id, split, view in bar
+    ]
+    found = rows.merge(photographs, on=_PHOTOGRAPH, how="left")["texture"]
+    return views.assign(texture=found.to_numpy(np.float64))
 
 
 def texture_tables(

@@ -36,7 +36,7 @@ from xrgs.safeio.files import is_inside, is_name, remove_path, sync_name, sync_t
 from xrgs.safeio.hashing import digest
 from xrgs.safeio.records import errors_named, read_file, read_struct, read_table
 from xrgs.safeio.sanitize import counted, for_line
-from xrgs.store import trimming
+from xrgs.store import texture, trimming
 from xrgs.store.cell_folder import CONFIG, NOT_RESULTS, STATUS, CellFolder, CellState
 from xrgs.store.identity import cell_id
 from xrgs.store.schema import FileEntry, SweepRecord
@@ -165,10 +165,11 @@ def _variant(store: Store, variant_id: str) -> _Files:
     if damage := trimming.verify_variant(folder):
         raise StoreError("; ".join(damage))
     modified = (folder / saved_variant.MANIFEST).lstat().st_mtime
-    return {
-        f"variants/{trimmed.name}/{name}": (read_file(folder / name, _MAX_POINTS_BYTES), modified)
-        for name in (saved_variant.MANIFEST, saved_variant.POINTS, saved_variant.REPORT)
-    }
+    names = (saved_variant.MANIFEST, saved_variant.POINTS, saved_variant.REPORT)
+    contents = {name: read_file(folder / name, _MAX_POINTS_BYTES) for name in names}
+    if known := texture.textures(folder):
+        contents[texture.FILE] = json_text(known).encode()
+    return {f"variants/{trimmed.name}/{name}": (of, modified) for name, of in contents.items()}
 
 
 def _record(store: Store, sweep_id: str, here: Path) -> _Files:
@@ -426,6 +427,8 @@ def _check_variant(folder: Path) -> None:
     if damage := (trimming.verify_variant if is_trimmed else variant.verify)(folder):
         raise StoreError("; ".join(damage))
     read_struct(folder / saved_variant.REPORT, dict[str, Any])
+    if (folder / texture.FILE).exists():
+        texture.textures(folder)
 
 
 def _check_scene(folder: Path) -> None:

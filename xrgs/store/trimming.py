@@ -2,9 +2,9 @@
 
 A trimmed cell stays done: the files that tables are made of stay, and its `status.json` lists the
 removed files with their sizes and hashes. A trimmed variant keeps its list of views, cameras,
-points and SfM report, in the folder `variants/trimmed-<id>`. Its cells are still found and
-reported. Before a new cell is trained on it, its images are made again from the photographs. SfM is
-not run again: on another machine it may give other cameras.
+points, SfM report and the texture of each view, in the folder `variants/trimmed-<id>`. Its cells
+are still found and reported. Before a new cell is trained on it, its images are made again from the
+photographs. SfM is not run again: on another machine it may place the cameras otherwise.
 """
 
 from __future__ import annotations
@@ -16,8 +16,10 @@ from xrgs.mixture import saved_variant
 from xrgs.mixture.paths import id_of, is_trimmed, trimmed_folder
 from xrgs.runtime import lease
 from xrgs.safeio import checksums
+from xrgs.safeio.atomic import write_json
 from xrgs.safeio.files import file_bytes, remove_path, sync_name, sync_tree
 from xrgs.safeio.records import list_folder
+from xrgs.store import texture
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -50,7 +52,8 @@ def check_images(variants: Path, variant_id: str) -> None:
 def trim_variant(variants: Path, variant_id: str) -> None:
     """Remove the images of a variant, and mark it as trimmed by the name of its folder.
 
-    For a trimmed variant, this completes a removal that was stopped, or changes nothing.
+    The texture of each view is kept. Trimming a trimmed variant completes a removal that was
+    stopped, and else changes nothing.
 
     Raises:
         OSError: The folder can't be renamed, or the images can't be removed.
@@ -59,6 +62,8 @@ def trim_variant(variants: Path, variant_id: str) -> None:
     if folder.is_dir():
         folder.rename(trimmed)
         sync_name(trimmed)
+    if (trimmed / _IMAGES).is_dir() and not (trimmed / texture.FILE).exists():
+        write_json(trimmed / texture.FILE, texture.textures(trimmed))
     remove_path(trimmed / _IMAGES)
 
 
