@@ -77,7 +77,7 @@ def test_the_printed_commands_make_the_committed_tables(
     for pack in sorted((REPORTS / study).rglob("store.tar.xz")):
         with tarfile.open(pack) as archive:
             archive.extractall(tmp_path, filter="data")
-    compared = set()
+    compared: set[Path] = set()
     for options in commands(REPORTS / study / "NOTES.md"):
         folder = Path(*options.get("--out", ["elsewhere"]))
         if "--external" in options:  # the renders of another program are in no pack

@@ -385,7 +385,7 @@ def _stale_warning(sweep: Sweep) -> list[str]:
     if stale.empty:
         return []
     names = {name for text in stale["stale"] for name in text.split()}
-    always = set() if PROTOCOL not in names else {m.name for m in METRICS if not m.optional}
+    always = {m.name for m in METRICS if PROTOCOL in names and not m.optional}
     scores = [m.label for m in METRICS if m.score and m.name in names | always]
     return [
         f"Scores of {counted(len(stale), 'cell')} are missing, or other code than the installed has"
