@@ -420,7 +420,7 @@ def test_a_new_protocol_makes_every_score_stale(made: Any) -> None:
 def test_a_stale_score_that_is_taken_on_request_is_named(made: Any) -> None:
     made.add(scored_by={"lpips_vgg": "old"})
     made.write()
-    assert "installed (LPIPS (VGG)):" in build(made.store.path, pictures=[]).text
+    assert "computed them (LPIPS (VGG)):" in build(made.store.path, pictures=[]).text
 
 
 def test_cells_csv_has_steps_size_and_factor(made: Any) -> None:

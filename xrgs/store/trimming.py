@@ -114,6 +114,7 @@ def restore_variant(
             ) from error
         finally:
             remove_path(work)
+        remove_path(folder / texture.FILE)  # it can be measured again
         sync_tree(folder)
         folder.rename(variants / variant_id)
         sync_name(variants / variant_id)

@@ -138,9 +138,10 @@ def test_with_absgrad_a_refinement_is_gsplats(seed: int) -> None:
 
 
 @pytest.mark.slow
-def test_a_run_of_1000_steps_is_gsplats() -> None:
-    steps = 1000
-    config = DensifySettings().scaled(steps)
+@pytest.mark.parametrize("resets", [True, False])
+def test_a_run_of_3000_steps_is_gsplats(resets: bool) -> None:
+    steps = 3000
+    config = DensifySettings(resets=resets).scaled(steps)
     rng = np.random.default_rng(0)
     values = random_values(150, rng)
     ours, theirs = make_both(values, config, 1)
@@ -169,6 +170,7 @@ def test_a_run_of_1000_steps_is_gsplats() -> None:
     assert all(torch.equal(ours.gaussians[name], frozen[name]) for name in PARAMETERS)
     # The run went through every rule, many times.
     assert total.pop("pruned_non_finite") == 0
+    assert (total.pop("reset") > 50) == resets
     assert all(n > 50 for n in total.values()), total
 
 
