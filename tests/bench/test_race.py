@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import importlib
 import math
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterable
@@ -94,6 +95,22 @@ def test_runs_are_read_as_they_were_written(race: Any, tmp_path: Path) -> None:
     (tmp_path / "race.csv").write_text(table)
     assert repr(race.race_table.read(tmp_path)) == repr(runs)
     assert race.race_table.read(tmp_path / "none") == []
+
+
+def test_the_committed_race_makes_its_table_again(race: Any, tmp_path: Path) -> None:
+    committed = BENCHMARKS.parent / "reports" / "race"
+    shutil.copy(committed / "race.csv", tmp_path)
+    race.race_table.write(tmp_path, None, "")
+    table = (committed / "table.md").read_text()
+    assert (tmp_path / "table.md").read_text() == table
+    assert table in (BENCHMARKS.parent / "docs" / "speed.md").read_text()
+
+
+def test_programs_that_disturb_only_runs_that_are_not_counted_are_no_matter(race: Any) -> None:
+    probe, counted = made(race, others=0.5), made(race, steps=900, seconds=50.0, others=0.05)
+    assert "No result" not in "\n".join(race.race_table.notes([probe, counted]))
+    disturbed = replace(counted, others=0.5)
+    assert "up to 0.5 cores" in "\n".join(race.race_table.notes([probe, disturbed]))
 
 
 def scenes(race: Any, arm: str, psnr: Iterable[float], lpips: Iterable[float]) -> list[Any]:
