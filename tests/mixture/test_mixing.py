@@ -517,7 +517,7 @@ def test_a_collection_of_many_cameras_is_registered(
         pytest.skip(f"{source} is not there")
     files = tuple(sorted(source.iterdir())[:16])
     sizes = [images.size(file) for file in files]
-    few = {"max_num_features": 1500, "long_side": 480}
+    few = {"max_num_features": 1500, "long_side": 640}
     conf = configured(long_side=320, tags="sampling_rate", factor=2, sfm=few)
     (tmp_path / "out/images").mkdir(parents=True)
     made = mixing.mix_resolutions(

@@ -161,7 +161,7 @@ def test_fern_is_registered_at_a_reduced_size(build: Build, data_root: Path) -> 
         pytest.skip(f"{path} is not there")
     built = build(
         scene_conf("folder", path, name="fern"),
-        sfm={"max_num_features": 2000, "long_side": 378},
+        sfm={"max_num_features": 2000, "long_side": 504},
     )
     assert built.report["registered"] == 20
     assert len(select(built, "test", "HR")) == 3
