@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -69,18 +70,16 @@ def test_every_file_of_photos_and_mixture_counts_always_or_with_a_part(
     """A line of code at the end of each file in turn; registries and downloads don't count."""
     monkeypatch.setattr(poses, "fingerprint", lambda _: "poses")
 
-    def codes() -> list[dict[str, str]]:
-        confs = [configured(**change, poses="anything") for change in CHANGES.values()]
-        return [
-            *(variant.all_code(SCENE, conf) for conf in confs),
-            *({kind: scenes.code_of(kind)} for kind in scenes.KINDS),
-        ]
-
-    before, uncounted = codes(), set()
+    confs = [configured(**change, poses="anything") for change in CHANGES.values()]
+    codes: list[Callable[[], object]] = [
+        *(partial(variant.all_code, SCENE, conf) for conf in confs),
+        *(partial(scenes.code_of, kind) for kind in scenes.KINDS),
+    ]
+    before, uncounted = [code() for code in codes], set()
     for file in [file for name in ("mixture", "photos") for file in (package / name).rglob("*.py")]:
         text = file.read_text()
         add_to(file)
-        if codes() == before:
+        if all(code() == expected for code, expected in zip(codes, before, strict=True)):
             uncounted.add(file.relative_to(package).as_posix())
         file.write_text(text)
     assert uncounted == {
