@@ -53,7 +53,7 @@ def test_a_masked_photograph_has_the_texture_of_the_used_part(variant: Path) -> 
     mask = np.zeros((20, 30), np.uint8)
     mask[:, 15:] = 255
     Image.fromarray(mask).save(variant / "images" / "test-masks" / "b.png")
-    part = image[:, 15:].astype(np.float32) / 255
+    part = (image[:, 15:] / 255).astype(np.float32)
     assert texture_of(variant, "test/b") == pytest.approx(texture(part), rel=1e-6)
     assert list(textures(variant)) == ["test/b"]
 
