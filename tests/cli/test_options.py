@@ -38,7 +38,7 @@ def test_help_has_what_is_said_of_an_option_without_the_breaks_of_its_lines(
     code, out, _ = call_command("render", "--help")
     assert code == 0
     (line,) = (line for line in out.splitlines() if "`orbit` circles" in line)
-    assert "have the focal length of the first one." in line
+    assert "have the focal length of the first test view." in line
 
 
 @pytest.mark.parametrize("command", ["sweep", *COMMANDS])
