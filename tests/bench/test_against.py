@@ -42,6 +42,36 @@ def test_ratios_are_taken_repetition_by_repetition() -> None:
     assert render["times_faster_high"] == pytest.approx(4)
 
 
+def test_both_processes_are_started_anew_after_a_few_repetitions(
+    load: Load, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A process that is slow for as long as it lives is one of several, on either side."""
+    started: list[str] = []
+
+    class Worker:
+        def __init__(self, python: str, log: Path) -> None:
+            started.append(log.name)
+            self.ms = 20.0 if started.count(log.name) == 1 and log.name == "this" else 10.0
+
+        def __enter__(self) -> Worker:
+            return self
+
+        def __exit__(self, *error: object) -> None:
+            pass
+
+        def send(self, request: dict[str, object]) -> None:
+            pass
+
+        def answer(self) -> dict[str, float]:
+            return {"ms": self.ms}
+
+    monkeypatch.setattr(against, "_Worker", Worker)
+    found = against.measure(sys.executable, load, (load, load), [1], 11)
+    assert started == ["this", "other", "other", "this", "this", "other"]
+    row = found["rows"][0]
+    assert (row["times_faster_low"], row["times_faster"]) == (0.5, 1.0)
+
+
 @pytest.mark.slow
 def test_an_installation_is_compared_with_itself(tmp_path: Path) -> None:
     if resolve_backend("auto") != "native":

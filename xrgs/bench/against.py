@@ -2,7 +2,7 @@
 
 Each installation runs its `xrgs.bench.against_worker` in a process, which runs one repetition for
 each request. The two processes take turns, so that other work on the machine slows both down, and
-the ratio of two consecutive repetitions stays valid.
+the ratio of two consecutive repetitions stays valid. Both are started anew after a few repetitions.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from xrgs.errors import XrgsError
 from xrgs.runtime.progress import progress
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -37,6 +37,9 @@ HR_SHARE = 0.3  # fraction of HR steps in a mixed-resolution training
 SIDES = ("this", "other")
 RENDER, HR_STEP, LR_STEP, MEAN_STEP = "render", "HR step", "LR step", "mean step"
 _LAST_LINES = 3  # of a failed worker's output that the error shows
+#: Repetitions of one pair of processes. A process is faster or slower for as long as it lives,
+#: by where its memory lies: an installation took 0.72 to 1.25 times as long as itself in one pair.
+_PAIR_REPEATS = 5
 
 
 def measure(
@@ -63,23 +66,34 @@ def measure(
     other = str(Path(python).absolute())
     if not (Path(other).is_file() and os.access(other, os.X_OK)):
         raise XrgsError(f"--against {python}: must be the Python executable of an environment")
-    with ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="xrgs-bench-")))
+    with tempfile.TemporaryDirectory(prefix="xrgs-bench-") as name:
+        folder = Path(name)
         files = {}
-        for name, load in zip((RENDER, HR_STEP, LR_STEP), (scene, *step), strict=True):
-            files[name] = str(folder / f"{name}.npz")
-            loads.write(Path(files[name]), load)
-        workers = {
-            side: stack.enter_context(_Worker(executable, folder / side))
-            for side, executable in zip(SIDES, (sys.executable, other), strict=True)
-        }
+        for task, load in zip((RENDER, HR_STEP, LR_STEP), (scene, *step), strict=True):
+            files[task] = str(folder / f"{task}.npz")
+            loads.write(Path(files[task]), load)
         setup = {"scene": files[RENDER], "views": {key: files[key] for key in (HR_STEP, LR_STEP)}}
-        for worker in workers.values():
-            worker.send(setup)
-        answers: dict[str, Any] = {side: worker.answer() for side, worker in workers.items()}
-        durations = _take_turns(workers, [*files], counts, repeats)
+        executables = dict(zip(SIDES, (sys.executable, other), strict=True))
+        cases = [(task, count) for task in files for count in counts]
+        durations: dict[tuple[str, str, int], list[float]] = {
+            (side, *case): [] for side in SIDES for case in cases
+        }
+        answers: dict[str, Any] = {}
+        for done in progress(range(0, repeats, _PAIR_REPEATS), "comparing", "pair"):
+            order = SIDES if done // _PAIR_REPEATS % 2 == 0 else SIDES[::-1]
+            with ExitStack() as pair:
+                workers = {
+                    side: pair.enter_context(_Worker(executables[side], folder / side))
+                    for side in order
+                }
+                for worker in workers.values():
+                    worker.send(setup)
+                answers |= {side: worker.answer() for side, worker in workers.items()}
+                for case, ms in _take_turns(workers, cases, min(_PAIR_REPEATS, repeats - done)):
+                    durations[case].append(ms)
+    timed = {case: np.array(values) for case, values in durations.items()}
     sizes = {"scene": scene.sizes, "step": step[0].sizes}
-    return answers | sizes | {"rows": summarize(durations, counts)}
+    return answers | sizes | {"rows": summarize(timed, counts)}
 
 
 class _Worker:
@@ -146,21 +160,16 @@ class _Worker:
 
 
 def _take_turns(
-    workers: Mapping[str, _Worker], tasks: Sequence[str], counts: Sequence[int], repeats: int
-) -> Durations:
-    """Run each task in each worker once to warm up, then time the tasks in turn."""
-    cases = [(task, count) for task in tasks for count in counts]
-    durations: dict[tuple[str, str, int], list[float]] = {
-        (side, *case): [] for side in SIDES for case in cases
-    }
-    for repeat in progress(range(repeats + 1), "comparing", "repeat", repeats + 1):
+    workers: Mapping[str, _Worker], cases: Sequence[tuple[str, int]], repeats: int
+) -> Iterator[tuple[tuple[str, str, int], float]]:
+    """Run each case in each worker once to warm up, then yield the times of repetitions in turn."""
+    for repeat in range(repeats + 1):
         for task, count in cases:
             for side, worker in workers.items():
                 worker.send({"task": task, "threads": count})
                 ms = worker.answer()["ms"]
                 if repeat > 0:
-                    durations[side, task, count].append(ms)
-    return {case: np.array(values) for case, values in durations.items()}
+                    yield (side, task, count), ms
 
 
 def summarize(durations: Durations, counts: Sequence[int]) -> list[Row]:
