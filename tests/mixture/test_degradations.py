@@ -56,16 +56,6 @@ def test_digital_zoom_is_the_small_copy_enlarged(photo: np.ndarray) -> None:
         assert np.abs(zoomed[..., c] - np.asarray(band)).max() < 1e-4
 
 
-def test_digital_zoom_keeps_what_is_coarse_and_nothing_finer(photo: np.ndarray) -> None:
-    """Of the power beyond twice the small copy's Nyquist frequency, bicubic leaves a few %."""
-    zoomed = degraded("digital_zoom", photo)
-    power = [np.abs(np.fft.fft2(p[..., 1] - p[..., 1].mean())) ** 2 for p in (photo, zoomed)]
-    fine = np.maximum(*np.abs(np.meshgrid(np.fft.fftfreq(100), np.fft.fftfreq(80)))) > 0.2
-    coarse = ~fine
-    assert power[1][fine].sum() < 0.1 * power[0][fine].sum()
-    assert power[1][coarse].sum() > 0.5 * power[0][coarse].sum()
-
-
 def test_jpeg_is_what_pillows_encoder_gives(photo: np.ndarray) -> None:
     stream = io.BytesIO()
     pixels = Image.fromarray(np.round(photo * 255).astype(np.uint8))
@@ -73,14 +63,6 @@ def test_jpeg_is_what_pillows_encoder_gives(photo: np.ndarray) -> None:
     expected = np.asarray(Image.open(stream), dtype=np.float32) / np.float32(255)
     found = degraded("jpeg", photo)
     assert np.array_equal(found, expected)
-
-
-def test_jpeg_loses_more_at_lower_quality(photo: np.ndarray) -> None:
-    grey = np.repeat(photo.mean(-1, keepdims=True), 3, -1)  # colour noise is lost at any quality
-    confs = [replace(CONF, jpeg_quality=quality) for quality in (5, 20, 60, 95)]
-    errors = [np.abs(degraded("jpeg", grey, conf) - grey).mean() for conf in confs]
-    assert errors == sorted(errors, reverse=True)
-    assert errors[0] > 2 * errors[-1] > 0
 
 
 def test_a_degradation_says_whether_views_become_smaller(photo: np.ndarray) -> None:

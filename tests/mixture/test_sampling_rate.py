@@ -79,13 +79,6 @@ def test_the_rate_is_focal_length_over_depth() -> None:
     assert sampling_rate.sampling_rate(K_of(40, 90), 3) == pytest.approx(20)
 
 
-def test_a_smaller_copy_has_a_lower_rate_by_its_factor() -> None:
-    small = LENS.resized(20, 16)
-    assert sampling_rate.sampling_rate(LENS.K, 3) == pytest.approx(
-        5 * sampling_rate.sampling_rate(small.K, 3)
-    )
-
-
 def test_distance_and_sampling_rate_can_disagree() -> None:
     """A far telephoto view has the higher sampling rate, a near wide-angle view the closer one."""
     views = [
@@ -111,16 +104,6 @@ def test_points_on_the_border_of_the_image_and_close_to_the_camera_count() -> No
             sampling_rate.median_depth(1.02 * np.array([point]) - [0, 0, 0.02], np.eye(4), LENS)
         )
     assert sampling_rate.median_depth(column(0.25, 0.5, 0.75), np.eye(4), LENS) == 0.5
-
-
-def test_each_view_has_the_depth_of_the_points_that_it_observes() -> None:
-    points = column(*[4.0] * 8, *[6.0] * 8, *[9.0] * 40)
-    poses = {0: np.eye(4), 3: np.eye(4)}
-    observed = {0: np.arange(8), 3: np.arange(8, 16)}
-    model = Reconstruction(
-        dict.fromkeys(poses, LENS), poses, points, np.zeros((56, 3), np.uint8), observed, {}
-    )
-    assert sampling_rate.median_depths(model) == {0: 4, 3: 6}
 
 
 def rates_of(*cameras: tuple[float, float], points: np.ndarray) -> np.ndarray:

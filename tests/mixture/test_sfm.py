@@ -20,30 +20,11 @@ from xrgs.photos.scenes.scene import bundled_photograph
 StereoPair = tuple[Path, sfm.Reconstruction]
 
 
-@pytest.mark.parametrize(
-    ("count", "asked", "expected"), [(2, 0, 8192), (24, 0, 4166), (100, 0, 1000), (24, 512, 512)]
-)
-def test_features_fall_with_the_number_of_images(count: int, asked: int, expected: int) -> None:
-    assert sfm.features_per_image(count, asked) == expected
-
-
-def test_features_of_small_images_are_detected_at_twice_the_resolution() -> None:
-    assert sfm.first_octave(252, None) == -1
-    assert sfm.first_octave(800, None) == -1
-    assert sfm.first_octave(801, None) == 0
-    assert sfm.first_octave(252, 0) == 0
-    assert sfm.first_octave(1008, -1) == -1
-
-
-def test_the_default_inliers_are_colmaps_own(sfm_conf: SfmConf) -> None:
-    import pycolmap
-
-    colmap = pycolmap.IncrementalPipelineOptions().mapper
-    made = sfm.mapping_options(sfm_conf, 24, known=False).mapper
-    assert made.abs_pose_min_num_inliers == colmap.abs_pose_min_num_inliers
-    assert made.init_min_num_inliers == colmap.init_min_num_inliers
-    fewer = sfm.mapping_options(replace(sfm_conf, min_inliers=15), 24, known=False).mapper
-    assert (fewer.abs_pose_min_num_inliers, fewer.init_min_num_inliers) == (15, 50)
+def test_features_fall_with_the_number_of_images_and_small_ones_are_doubled() -> None:
+    counts = [(2, 0), (24, 0), (100, 0), (24, 512)]
+    assert [sfm.features_per_image(*count) for count in counts] == [8192, 4166, 1000, 512]
+    sides: list[tuple[int, int | None]] = [(800, None), (801, None), (252, 0), (1008, -1)]
+    assert [sfm.first_octave(*side) for side in sides] == [-1, 0, 0, -1]
 
 
 def test_two_views_keep_the_points_that_only_two_see(sfm_conf: SfmConf) -> None:
@@ -56,6 +37,11 @@ def test_two_views_keep_the_points_that_only_two_see(sfm_conf: SfmConf) -> None:
     assert many.ba_refine_focal_length
     assert many.mapper.init_min_tri_angle == 4
     assert not sfm.mapping_options(sfm_conf, 24, known=True).ba_refine_extra_params
+    colmap = pycolmap.IncrementalPipelineOptions().mapper
+    assert many.mapper.abs_pose_min_num_inliers == colmap.abs_pose_min_num_inliers
+    assert many.mapper.init_min_num_inliers == colmap.init_min_num_inliers
+    fewer = sfm.mapping_options(replace(sfm_conf, min_inliers=15), 24, known=False).mapper
+    assert (fewer.abs_pose_min_num_inliers, fewer.init_min_num_inliers) == (15, 50)
 
 
 @pytest.fixture(scope="module")

@@ -146,7 +146,11 @@ def register(
             _log.warning("SfM attempt %s: %s", attempt.name, reason)
         return model, reason, attempt
 
-    for attempt in _attempts(photos, degraded, conf):
+    any_smaller = any(
+        photos.size(_kind(i, degraded), i) != photo.sfm for i, photo in enumerate(photos.all)
+    )
+    any_focal = any(photo.focal_35mm and photo.K is None for photo in photos.all)
+    for attempt in sfm_attempts(conf, len(photos), any_smaller=any_smaller, any_focal=any_focal):
         found = run(attempt)
         if best is None or _rank(*found[:2]) > _rank(*best[:2]):
             best = found
@@ -183,16 +187,6 @@ def _notes(attempt: Attempt, photos: PhotoCollection) -> Iterator[str]:
             f"cropped or zoomed, though EXIF does not say so: {names} fit with another focal length"
             " than the others of their camera, and have a camera of their own"
         )
-
-
-def _attempts(
-    photos: PhotoCollection, degraded: Collection[int], conf: SfmConf
-) -> Iterator[Attempt]:
-    any_smaller = any(
-        photos.size(_kind(i, degraded), i) != photo.sfm for i, photo in enumerate(photos.all)
-    )
-    any_focal = any(photo.focal_35mm and photo.K is None for photo in photos.all)
-    yield from sfm_attempts(conf, len(photos), any_smaller=any_smaller, any_focal=any_focal)
 
 
 def _rank(model: sfm.Reconstruction, refused: str) -> tuple[bool, int]:

@@ -64,7 +64,6 @@ def find(folder: str, photographs: Mapping[str, Path]) -> tuple[dict[str, Path],
         on masks without a photograph.
 
     Raises:
-        UnreadableError: The folder can't be read now.
         XrgsError: The folder is missing, none of its images is the mask of a photograph, or two are
             masks of one.
     """
@@ -150,9 +149,7 @@ class Masks:
             headers: The headers of the photographs.
 
         Raises:
-            UnreadableError: A mask can't be read now.
-            ImageError: A mask is no image.
-            XrgsError: A mask has another shape than its photograph.
+            XrgsError: A mask has another shape than its photograph, or is no image.
         """
         files = {name: file for name, file in files.items() if name in headers}
         stored, seen, either = set[str](), set[str](), set[str]()
@@ -190,10 +187,6 @@ class Masks:
         Returns:
             The mask [H, W] at the photograph's size, None if there is none; and a note, empty for a
             black and white mask.
-
-        Raises:
-            UnreadableError: The mask can't be read now.
-            ImageError: The mask can't be decoded.
         """
         if name not in self.files:
             return None, ""

@@ -24,9 +24,7 @@ def scene_of(path: object) -> SceneConf:
     return scene_conf("folder", path)
 
 
-@pytest.mark.parametrize(
-    ("long_side", "width"), [(0, 400), (20, 50), (50, 50), (51, 100), (999, 400)]
-)
+@pytest.mark.parametrize(("long_side", "width"), [(0, 400), (50, 50), (51, 100), (999, 400)])
 def test_an_llff_scene_gives_the_smallest_copies_that_suffice(
     fill: Fill, tmp_path: Path, long_side: int, width: int
 ) -> None:
@@ -105,18 +103,6 @@ def test_what_is_no_regular_file_is_left_out_with_a_warning(fill: Fill, tmp_path
     )
 
 
-def test_a_link_to_a_photograph_is_one(fill: Fill, tmp_path: Path) -> None:
-    fill(tmp_path / "originals", "a.png", "b.png")
-    (tmp_path / "x").mkdir()
-    for name in ("a.png", "b.png"):
-        (tmp_path / "x" / name).symlink_to(tmp_path / "originals" / name)
-    scene = scenes.resolve(
-        scene_of(tmp_path / "x"),
-        tmp_path,
-    )
-    assert [images.read(file).shape for file in scene.files.values()] == [(30, 40, 3)] * 2
-
-
 def test_a_photograph_that_cant_be_read_now_stops_the_plan(
     fill: Fill, tmp_path: Path, unreadable: Callable[[str], None]
 ) -> None:
@@ -150,12 +136,6 @@ def test_all_folders_below_are_taken_where_the_path_asks_for_them(
     }
     assert (scene.name, scene.notes) == ("x", ())
     assert scenes.fingerprint(nested) != scenes.fingerprint(flat)
-
-
-def test_a_folder_of_folders_says_how_to_read_them(fill: Fill, tmp_path: Path) -> None:
-    fill(tmp_path / "x" / "one", "a.png", "b.png")
-    with pytest.raises(XrgsError, match=r"no image in it.*images left out: 2 in one .*/\*\* takes"):
-        scenes.fingerprint(scene_of(tmp_path / "x"))
 
 
 def test_names_that_nested_folders_share_are_refused(fill: Fill, tmp_path: Path) -> None:
@@ -215,9 +195,10 @@ def test_grey_photographs_among_those_in_colour_are_named(fill: Fill, tmp_path: 
 
 def test_what_is_not_read_is_named(fill: Fill, tmp_path: Path) -> None:
     conf = fill(tmp_path / "x", "a.png", "b.png")
-    for name in ("c.DNG", "d.mov", "notes.txt"):
+    for name in ("c.DNG", "d.mov", "more.zip", "notes.txt"):
         (tmp_path / "x" / name).write_bytes(b"content")
-    videos, formats = scenes.resolve(conf, tmp_path).notes
+    videos, formats, archives = scenes.resolve(conf, tmp_path).notes
+    assert archives == "archives, which are not looked into; unpack them: more.zip"
     assert "images left out: 1 of a format that is not read (c.DNG)" in formats
     assert f"videos left out: 1 (scene=video scene.path={tmp_path / 'x' / 'd.mov'}" in videos
     fill(tmp_path / "y" / "one", "a.png", "b.png")
@@ -239,10 +220,10 @@ def test_heic_is_listed_and_needs_its_package(
 
 
 SAVED = {
-    **dict.fromkeys((".jpe", ".jfif", ".JPG", ".JPE", ".jpg_large", "", ".bak"), "JPEG"),
-    **dict.fromkeys((".ppm", ".pgm", ".pnm"), "PPM"),
-    **dict.fromkeys((".bmp", ".dib"), "BMP"),
-    **dict.fromkeys((".tga", ".TGA"), "TGA"),
+    **dict.fromkeys((".jfif", ".JPG", ".jpg_large", ""), "JPEG"),
+    ".pgm": "PPM",
+    ".dib": "BMP",
+    ".TGA": "TGA",
     ".mpo": "MPO",
     ".jp2": "JPEG2000",
     ".avif": "AVIF",
@@ -271,20 +252,18 @@ def test_photographs_of_any_suffix_that_pillow_opens_are_taken(
     assert np.abs(shown - truth).max() < 0.06  # JPEG and AVIF lose a little
 
 
-@pytest.mark.parametrize("bits", [8, 16])
-def test_a_grey_map_of_16_bits_is_not_cut(tmp_path: Path, bits: int) -> None:
-    most = (1 << bits) - 1
-    values = np.linspace(0, most, 12).round().astype(">u2" if bits == 16 else "u1")
-    (tmp_path / "a.pgm").write_bytes(b"P5 4 3 %d\n" % most + values.tobytes())
-    truth = values.reshape(3, 4, 1).astype(np.float64) / most
+def test_a_grey_map_of_16_bits_is_not_cut(tmp_path: Path) -> None:
+    values = np.linspace(0, 65535, 12).round().astype(">u2")
+    (tmp_path / "a.pgm").write_bytes(b"P5 4 3 65535\n" + values.tobytes())
+    truth = values.reshape(3, 4, 1).astype(np.float64) / 65535
     assert np.abs(images.read(tmp_path / "a.pgm") - truth).max() < 1e-6
-    assert images.header(tmp_path / "a.pgm").bits == bits
+    assert images.header(tmp_path / "a.pgm").bits == 16
 
 
 @pytest.mark.parametrize(
     ("name", "content"),
     [
-        *((f"IMG_1{suffix}", b"content") for suffix in (".gif", ".iiq", ".thm", ".exr", ".insp")),
+        ("IMG_1.exr", b"content"),
         ("IMG_1", b"GIF89a" + bytes(20)),
         ("IMG_1.raw16", b"II*\0" + bytes(20)),
     ],
@@ -306,9 +285,7 @@ def test_images_that_are_not_read_are_named(
     ("name", "what"),
     [
         ("a.zip", "an archive (.zip), not a folder; unpack it"),
-        ("a.TAR", "an archive (.tar), not a folder; unpack it"),
         ("a.mp4", "a video, not a folder; scene=video takes its frames"),
-        ("a.out", "a file of Bundler, not a folder; give the folder that the photographs are in"),
         (
             "a.xml",
             "as Metashape's cameras are, not a folder; give the folder that the photographs are in",
@@ -322,35 +299,23 @@ def test_a_file_in_place_of_the_folder_is_named(tmp_path: Path, name: str, what:
     assert what in str(caught.value)
 
 
-def test_an_archive_among_photographs_is_named(fill: Fill, tmp_path: Path) -> None:
-    fill(tmp_path, "a.jpg", "b.jpg")
-    (tmp_path / "more.zip").write_bytes(b"content")
-    notes = scenes_folder.look(str(tmp_path), 0).notes
-    assert notes == ("archives, which are not looked into; unpack them: more.zip",)
-
-
 @pytest.mark.parametrize(
     "form",
     [
-        *("{}_mask.png", "{}.mask.jpg", "{}.jpg.mask.png", "{}_mask_0.png", "mask_{}.png"),
-        *("{}-seg.png", "{}_MASK.PNG", "{}.png", "{}_sam.png", "person_{}.png", "{}.alpha.tif"),
+        *("{}.jpg.mask.png", "{}_mask_0.png", "mask_{}.png", "{}_depth.png"),
+        *("{}_MASK.PNG", "{}.png", "person_{}.png", "{}.alpha.tif"),
     ],
 )
 def test_masks_of_other_programs_beside_photographs_are_no_photographs(
     fill: Fill, tmp_path: Path, form: str
 ) -> None:
-    fill(tmp_path, "IMG_1.jpg", "IMG_2.jpg", "IMG_3.jpg")
+    fill(tmp_path, "IMG_1.jpg", "IMG_2.jpg", "IMG_3.jpg", "IMG_1_2.jpg", "a_IMG_1.jpg")
     mask = Image.fromarray(np.uint8(255 * (np.indices((30, 40)).sum(0) > 30)))
     for name in ("IMG_1", "IMG_2"):
         mask.save(tmp_path / form.format(name))
     found = scenes_folder.look(str(tmp_path), 0)
-    assert [*found.files] == ["IMG_1", "IMG_2", "IMG_3"]
+    assert [*found.files] == ["IMG_1", "IMG_1_2", "IMG_2", "IMG_3", "a_IMG_1"]
     assert all(file.suffix == ".jpg" and "mask" not in file.name for file in found.files.values())
     (note,) = found.notes
     assert note.startswith("2 images left out, which are masks, depth maps or thumbnails")
     assert form.format("IMG_1") in note
-
-
-def test_photographs_whose_names_begin_alike_are_kept(fill: Fill, tmp_path: Path) -> None:
-    fill(tmp_path, "IMG_1.jpg", "IMG_1_2.jpg", "IMG_1 (3).jpg", "a_IMG_1.jpg")
-    assert len(scenes_folder.look(str(tmp_path), 0).files) == 4
