@@ -7,7 +7,7 @@ import math
 import os
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, Any
+from typing import Annotated
 
 import pytest
 from hypothesis import given
@@ -48,12 +48,10 @@ def test_a_struct_is_read(file: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "what"),
     [
-        ("", "not valid JSON"),
         ('{"seed": 3', "not valid JSON"),
+        ("[" * 100_000 + "]" * 100_000, "the file: Expected `object`, got `array`"),
         ('{"seed":' + "[" * 100_000, "seed: Expected `int`, got `array`"),
-        ('{"seed": NaN}', "not valid JSON"),
         ('{"seed": "\\ud800"}', "not valid JSON"),
-        ("[]", "the file: Expected `object`"),
         ("{}", "the file: Object missing required field `seed`"),
         ('{"seed": -1}', "seed: Expected `int` >= 0"),
         ('{"seed": "3"}', "seed: Expected `int`, got `str`"),
@@ -65,15 +63,7 @@ def test_a_damaged_struct_is_named_with_its_field(file: Path, content: str, what
     file.write_text(content)
     with pytest.raises(StoreError, match=f"^damaged: {file}: {what}"):
         read_struct(file, Cell)
-
-
-def test_json_of_any_depth_is_read_or_refused(file: Path) -> None:
-    file.write_text("[" * 100_000 + "]" * 100_000)
-    with pytest.raises(StoreError, match=f"damaged: {file}: not valid JSON"):
-        read_struct(file, Any)
-
-
-def test_a_missing_struct_is_named(file: Path) -> None:
+    file.unlink()
     with pytest.raises(StoreError, match=f"{file}: No such file"):
         read_struct(file, Cell)
 
@@ -92,27 +82,14 @@ def test_a_table_whose_rows_do_not_fit_is_refused_by_name(file: Path, text: str)
         read_table(file)
 
 
-@pytest.mark.parametrize(
-    ("value", "number"), [(1, 1.0), (1.5, 1.5), ("1e3", 1000.0), ("inf", math.inf)]
-)
-def test_numbers_are_read(value: object, number: float) -> None:
-    assert as_number(value) == number
-
-
-@pytest.mark.parametrize("value", [math.inf, "-inf", "1e400", 1e30, "-1e30"])
-def test_infinity_and_the_largest_number_are_numbers(value: float | str) -> None:
-    assert as_number(value) == float(value)
-
-
-@pytest.mark.parametrize("value", [None, ""])
-def test_a_missing_number_is_nan(value: object) -> None:
-    assert math.isnan(as_number(value))
-
-
-@pytest.mark.parametrize("value", [True, [], {}, "x", 10**400, 1.1e30, "-1.1e30", "1e308"])
-def test_anything_else_is_not_a_number(value: object) -> None:
-    with pytest.raises(ValueError):  # noqa: PT011 - float's own messages
-        as_number(value)
+def test_numbers_are_read_and_anything_else_refused() -> None:
+    for value in (1, 1.5, "1e3", "inf", "-inf", "1e400", 1e30, "-1e30"):
+        assert as_number(value) == float(value)
+    assert math.isnan(as_number(None))
+    assert math.isnan(as_number(""))
+    for wrong in (True, [], {}, "x", 10**400, 1.1e30, "-1.1e30"):
+        with pytest.raises(ValueError):  # noqa: PT011 - float's own messages
+            as_number(wrong)
 
 
 @given(
