@@ -150,9 +150,7 @@ def _up_to_vertices(elements: list[_Element]) -> tuple[list[_Element], _Element]
         raise ValueError(f"the .ply header must have one element vertex, its elements are: {has}")
     at = names.index("vertex")
     if lists := [element.name for element in elements[: at + 1] if element.has_lists]:
-        raise ValueError(
-            f"the element {lists[0]} has lists, which are read over only behind vertex"
-        )
+        raise ValueError(f"the element {lists[0]} has lists, and only those behind vertex may")
     properties = [name for name, _ in elements[at].properties]
     if len(set(properties)) != len(properties):
         raise ValueError("the .ply header names a property of vertex twice")
