@@ -140,14 +140,8 @@ def _check_size(
 ) -> None:
     """Refuse an image that is too large, or that a file of so few bytes can't hold.
 
-    It is called before memory for the pixels is taken.
-
-    Args:
-        stream: The file.
-        size: Width and height, px.
-        max_pixels: The most pixels that it may have.
-        bits: Bits per pixel before compression.
-        drawing: Whether it may be a drawing: a small one compresses without limit.
+    It is called before memory for the pixels is taken. `size` is in px, and `bits` are those of a
+    pixel before compression. A small drawing compresses without limit.
     """
     width, height = size
     if width * height > max_pixels:
@@ -185,11 +179,7 @@ def _formats(start: bytes, suffix: str) -> tuple[str, ...]:
 def is_photograph(path: Path) -> bool | None:
     """Return whether a file without an image's suffix is a photograph, by its first bytes.
 
-    Returns:
-        None where it may be an image of a format that is not read.
-
-    Raises:
-        OSError: The file can't be read.
+    None where it may be an image of a format that is not read; OSError if it can't be read.
     """
     with path.open("rb") as stream:
         start = stream.read(16)
@@ -539,10 +529,7 @@ def read_png(
 ) -> ImageArray:
     """Read an image of a store, a PNG as `save` writes it: [H, W, 3], its 8-bit values / 255.
 
-    Args:
-        path: The file.
-        size: The width and height that it must have, px; None admits any.
-        max_pixels: The most pixels that it may have.
+    `size` is the width and height that it must have, px; None admits any.
     """
     return np.asarray(read_png_pil(path, size, max_pixels), np.float32) / np.float32(255)
 
@@ -577,12 +564,10 @@ def read_png_pil(
 
 
 def save(path: Path, image: ImageArray, *, durable: bool = True) -> None:
-    """Write an 8-bit RGB PNG, clamped to 0..1 and rounded to nearest.
+    """Write an 8-bit RGB PNG of an image [H, W, 3], clamped to 0..1 and rounded to nearest.
 
-    Args:
-        path: The file, which is replaced atomically; its folder is made, but no parents of it.
-        image: [H, W, 3].
-        durable: As for `atomic_writer`.
+    The file is replaced atomically; its folder is made, but no parents of it. `durable` is as for
+    `atomic_writer`.
     """
     path.parent.mkdir(exist_ok=True)  # not parents: a store that vanished stays away
     with atomic_writer(path, durable=durable) as stream:

@@ -114,15 +114,14 @@ def list_photographs(path: str | None, long_side: int, masks: str | None = None)
 def look(path: str | None, long_side: int, masks: str | None = None) -> Listing:
     """List the image files of a scene's folder, with notes on what was left out.
 
+    The name of a view is the name of the file without its suffix; with `/**` the names of the
+    folders between come before it, joined by `_`.
+
     Args:
         path: `scene.path`, the folder; with `/**` at its end, all folders below it too.
         long_side: `variant.long_side`, px. Of an LLFF scene the smallest copies whose longer side
             is at least this long are taken; the largest if none is, or if this is 0.
         masks: `scene.masks`, a folder that is skipped; None if there is none.
-
-    Returns:
-        The files and the notes. The name of a view is the name of the file without its suffix; with
-        `/**` the names of the folders between come before it, joined by `_`.
 
     Raises:
         UnreadableError: The folder or a file in it can't be read now.
