@@ -64,11 +64,6 @@ def test_gradients_of_cameras_are_refused() -> None:
             rasterization(**wrong)
 
 
-def test_gsplats_global_shutter_is_its_default() -> None:
-    shutter = inspect.signature(gsplat.rasterization).parameters["rolling_shutter"].default
-    rasterization(**arguments(rolling_shutter=shutter))
-
-
 TENSORS = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "backgrounds")
 
 

@@ -123,24 +123,6 @@ def test_other_writers_orders_types_and_properties_are_read(
         assert torch.equal(loaded[name], make()[name])
 
 
-def test_bands_above_3_are_left_out_with_a_word(
-    tmp_path: Path, saved: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    table = PlyData.read(saved)["vertex"].data
-    rest = np.arange(len(table) * 72, dtype="f4").reshape(len(table), 3, 24)
-    others = [n for n in table.dtype.names if not n.startswith("f_rest")]
-    other = np.zeros(
-        len(table), [(n, "f4") for n in [*others, *(f"f_rest_{i}" for i in range(72))]]
-    )
-    for name in others:
-        other[name] = table[name]
-    for i in range(72):
-        other[f"f_rest_{i}"] = rest[:, i // 24, i % 24]
-    loaded = load_ply(written(tmp_path / "b.ply", other))
-    np.testing.assert_array_equal(loaded.shN.detach(), rest[:, :, :15].swapaxes(1, 2))
-    assert "has spherical harmonics of degree 4; bands above 3 are left out" in caplog.text
-
-
 def changed(saved: Path, **columns: Any) -> Path:
     """Write values into the columns of a saved file, for Gaussian 3."""
     table = PlyData.read(saved)["vertex"].data.copy()

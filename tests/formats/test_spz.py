@@ -153,16 +153,6 @@ def test_named_axes_are_turned_as_niantics_library_turns(
     torch.testing.assert_close(covariances(read), covariances(other), atol=1e-6, rtol=1e-5)
 
 
-def test_what_is_written_has_the_coordinates_and_names_no_axes(file: Path) -> None:
-    gaussians = scene(5)
-    write_spz(file, gaussians)
-    content = unpacked(file)
-    assert (content[4], content[14]) == (3, 0)
-    x = int.from_bytes(content[16:19], "little", signed=True) / 2 ** content[13]
-    y = int.from_bytes(content[19:22], "little", signed=True) / 2 ** content[13]
-    assert (x, y) == pytest.approx(gaussians.means[0, :2].tolist(), abs=1e-6)
-
-
 @pytest.mark.parametrize(
     ("extension", "message"),
     [

@@ -95,27 +95,6 @@ def test_sharp_kernels_are_not_called_blurry(views_of: Callable[..., list[View]]
     assert not any(blur_notes(blur) for blur in found.values())
 
 
-def test_views_of_one_scale_are_compared_at_their_size(save: Save) -> None:
-    """Where nothing is degraded, the ratio of the sampling rates is the views' own."""
-    from scipy.ndimage import gaussian_filter
-
-    high = [texture(seed, 160, 200) for seed in range(4)]
-    low = [gaussian_filter(texture(seed, 160, 200), (0.9, 0.9, 0)) for seed in range(4, 8)]
-    sharp = [save(image, "HR", rho) for image, rho in zip(high, (0.9, 1.0, 1.0, 0.8), strict=True)]
-    views = [*sharp, *(save(image, "LR", 0.9) for image in low)]
-    assert estimated(views) == pytest.approx(0.9, abs=0.06)
-    assert estimated([replace(view, tag="LR") for view in sharp] + views[:2]) < 0.2
-
-
-def test_other_views_than_those_that_are_trained_on_do_not_count(
-    views_of: Callable[..., list[View]], save: Save
-) -> None:
-    views = views_of([texture(0)], [texture(1)], "box")
-    flat = np.full((80, 100, 3), 0.5, np.float32)
-    others = [replace(save(flat, "HR", 1.0), split=split) for split in ("test", "original")]
-    assert estimated([*views, *others]) == estimated(views)
-
-
 def test_without_both_classes_or_enough_pixels_nothing_is_said(
     views_of: Callable[..., list[View]],
 ) -> None:

@@ -111,19 +111,6 @@ def test_phone_without_noise_is_a_blurred_box_through_jpeg(photo: np.ndarray) ->
     assert np.abs(degraded("phone", photo, noise=0.0) - compressed).max() <= 2 / 255
 
 
-def test_a_gaussian_of_phone_has_the_width_that_it_says() -> None:
-    """A line's variance grows by the blur's, 0.8^2, and by a pixel's box's, 1/12 LR px^2."""
-    line = np.zeros((80, 500, 3), np.float32)
-    line[:, 250:255] = 1
-    profile = degraded("phone", line, noise=0.0, jpeg_quality=95).mean((0, 2))
-    x = np.arange(100) + 0.5
-    profile = np.where(np.abs(x - 50.5) < 5, profile, 0)  # beyond, JPEG rounds
-    mean = (profile * x).sum() / profile.sum()
-    variance = (profile * (x - mean) ** 2).sum() / profile.sum()
-    own = 1 / 12  # the line is one LR px wide
-    assert variance == pytest.approx(own + 0.8**2 + 1 / 12, rel=0.05)
-
-
 def test_phones_noise_has_its_standard_deviation_in_each_channel() -> None:
     grey = np.full((500, 500, 3), 0.5, np.float32)
     for noise in (5.0, 10.0):  # quality 95 keeps the luma's noise, if it is not small

@@ -18,8 +18,7 @@ import yaml
 from tests.photos.scene_confs import scene_conf
 from xrgs import config
 from xrgs.config import VariantConf
-from xrgs.errors import XrgsError
-from xrgs.mixture import mixing, sfm, sfm_retries
+from xrgs.mixture import mixing, sfm
 from xrgs.mixture.degradations import DEGRADATIONS
 from xrgs.mixture.photographs import prepare_hr_views, write_degraded
 from xrgs.mixture.sfm import Reconstruction, SfmImage
@@ -176,17 +175,6 @@ def test_by_megapixels_the_larger_photographs_are_hr(
         assert (view.width, view.height) == ((160, 120) if number(view) % 3 == 0 else (80, 60))
 
 
-def test_photographs_of_one_class_alone_are_refused(mix: Mix, given: list[list[str]]) -> None:
-    with pytest.raises(XrgsError, match=r"variant\.tags=megapixels: every training view is HR at"):
-        mix(tags="megapixels")
-    assert given == []
-
-
-def test_a_threshold_above_all_but_the_held_out_is_named(mix: Mix) -> None:
-    with pytest.raises(XrgsError, match=r"variant\.hr_above=1\.0; their values are 0\.\d+ to"):
-        mix(tags="sampling_rate", hr_above=1.0, test_every=2)
-
-
 @pytest.mark.parametrize(("fraction", "tag"), [(0.0, "LR"), (1.0, "HR")])
 def test_one_class_alone_where_the_config_says_so(mix: Mix, fraction: float, tag: str) -> None:
     made = mix(hr_fraction=fraction)
@@ -251,21 +239,6 @@ def test_a_degradation_may_keep_the_size(
     assert given[0] == [f"{'sfm_lr' if i in low else 'sfm'}/{i:05d}.png" for i in range(VIEWS)]
 
 
-def test_lr_views_of_another_kernel_are_smaller(mix: Mix, given: list[list[str]]) -> None:
-    made = mix(degradation="phone", hr_fraction=0.5)
-    low = of(made, "train", "LR")
-    originals = {v.name: v for v in of(made, "original", "HR")}
-    assert {v.name for v in low} == originals.keys()
-    for view in low:
-        assert (view.width, view.height) == (32, 24)
-        assert view.sampling_rate == pytest.approx(originals[view.name].sampling_rate / 5)
-        high = images.read(originals[view.name].file)
-        assert 0 < np.abs(images.resize(high, 32, 24) - images.read(view.file)).mean() < 0.1
-    numbers = {number(v) for v in low}
-    expected = [f"{'sfm_lr_up' if i in numbers else 'sfm'}/{i:05d}.png" for i in range(VIEWS)]
-    assert given[0] == expected
-
-
 def test_noise_depends_on_a_views_name_and_on_the_seed_alone(
     rendered: Scene, configured: Make, tmp_path: Path
 ) -> None:
@@ -293,31 +266,6 @@ def test_exact_cameras_need_no_second_run_of_sfm(
     assert len(given) == 1
     assert made.report["pose_error_against"] == "exact cameras"
     assert 0 < made.report["pose_error"]["position_percent"] < 5
-
-
-EMPTY = Reconstruction(
-    {},
-    {},
-    np.zeros((0, 3)),
-    np.zeros((0, 3), np.uint8),
-    {},
-    {"lr_images": "", "registered": 0, "models": [], "points": 0},
-)
-
-
-def test_where_every_attempt_is_refused_the_report_has_them_all(
-    conf: VariantConf, rendered: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(sfm, "reconstruct", lambda *_: EMPTY)
-    (tmp_path / "out/images").mkdir(parents=True)
-    with pytest.raises(
-        SceneFailed, match="scene p failed: 0 of 12 photographs are placed"
-    ) as caught:
-        mixing.mix_resolutions(rendered, conf, tmp_path, tmp_path / "out")
-    tried = [a["attempt"] for a in caught.value.report["attempts"]]
-    attempts = sfm_retries.sfm_attempts(conf.sfm, VIEWS, any_smaller=True)
-    assert tried == [attempt.name for attempt in attempts]
-    assert tried[-1] == "native"
 
 
 def part(model: Reconstruction, views: int) -> Reconstruction:
@@ -422,15 +370,6 @@ def test_given_poses_replace_sfm_and_are_scaled_for_lr_views(
         assert scale in {1, 1 / 5}
         assert np.allclose(view.K, np.diag([scale, scale, 1]) @ exact, atol=1e-9)
     assert {v.name for v in of(made, "train", "LR")} == set(made.report["lr"]) - {names[-1]}
-
-
-def test_too_few_given_poses_are_refused(mix: Mix, rendered: Scene, tmp_path: Path) -> None:
-    write_poses(tmp_path / "poses", list(rendered.files)[:5])
-    with pytest.raises(
-        SceneFailed,
-        match=r"variant\.poses: 5 of 12 photographs are placed, 20 points; not placed: view_005",
-    ):
-        mix(poses=str(tmp_path / "poses"))
 
 
 # real photographs

@@ -50,15 +50,6 @@ def test_views_that_were_cropped_don_t_share_the_camera(
         assert np.array_equal(view.cam_from_world().matrix(), before[number])
 
 
-@pytest.mark.parametrize("stored", [0.0, 1e6])
-def test_errors_that_a_model_stores_decide_nothing(stored: float) -> None:
-    for factor, odd in ((1.0, ()), (1 / 0.7, (2,))):
-        model, given = cropped(factor, odd)
-        for point in model.points3D.values():
-            point.error = stored
-        assert sorted(own_cameras.other_cameras(model, given)) == list(odd)
-
-
 def test_cameras_that_are_known_or_apart_already_are_not_tried() -> None:
     model, given = cropped(1 / 0.7, (2, 5, 6))
     assert own_cameras.other_cameras(model, {}) == {}

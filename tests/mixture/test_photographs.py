@@ -108,20 +108,6 @@ def test_exif_tells_cameras_lenses_and_how_they_were_held(tmp_path: Path) -> Non
     assert camera_numbers(files) == [0, 0, 1, 2, 3, 0, 0, 4, 5]
 
 
-def test_a_photograph_taken_sideways_is_prepared_upright(tmp_path: Path) -> None:
-    """Stored 60 x 40 and turned by a quarter: bright left to right becomes top to bottom."""
-    files = [
-        write_photograph(tmp_path / "a.png"),
-        write_photograph(tmp_path / "b.png", orientation=6),
-    ]
-    photos = prepare_hr_views(Scene("x", "", {file.stem: file for file in files}), CONF, tmp_path)
-    assert [photo.size for photo in photos.all] == [(60, 40), (40, 60)]
-    assert photos[0].camera != photos[1].camera
-    upright = photos.read("hr", 1)
-    assert upright.shape == (60, 40, 3)
-    assert np.array_equal(upright, np.rot90(photos.read("hr", 0), -1))
-
-
 def test_all_are_shrunk_by_one_scale(tmp_path: Path) -> None:
     sizes = [(200, 100), (100, 200), (120, 60), (50, 50)]
     files = [write_photograph(tmp_path / f"{i}.png", size) for i, size in enumerate(sizes)]
@@ -134,15 +120,6 @@ def test_all_are_shrunk_by_one_scale(tmp_path: Path) -> None:
 
 def scene_of(*files: Path) -> Scene:
     return Scene("x", "", {file.stem: file for file in files})
-
-
-def test_a_photograph_too_small_for_its_copy_is_left_out(tmp_path: Path) -> None:
-    small = write_photograph(tmp_path / "small.png", (60, 21))
-    files = [write_photograph(tmp_path / f"{name}.png") for name in "ab"]
-    photos = prepare_hr_views(scene_of(*files, small), CONF, tmp_path)
-    assert photos.names == ["a", "b"]
-    (note,) = photos.notes
-    assert note.startswith("left out: small.png (variant.factor=2: LR views of 30x10 px are")
 
 
 @pytest.mark.parametrize(
@@ -216,16 +193,6 @@ def test_a_depth_map_is_left_out_beside_photographs(
     assert [photo.hr.resized for photo in photos.all] == [(60, 40)] * 2
     (note,) = photos.notes
     assert note.startswith(f"left out: depth.{suffix} (taken for a depth map: it has one channel")
-
-
-def test_photographs_that_are_all_grey_of_16_bits_are_photographs(tmp_path: Path) -> None:
-    files = [tmp_path / f"{name}.png" for name in "ab"]
-    grey = np.tile(np.linspace(0, 65535, 60).astype(np.uint16), (40, 1))
-    for file in files:
-        Image.fromarray(grey).save(file)
-    photos = prepare_hr_views(scene_of(*files), CONF, tmp_path)
-    assert photos.notes == ()
-    assert np.abs(photos.read("hr", 0) - (grey / 65535)[..., None]).max() <= 0.5 / 255 + 1e-6
 
 
 def test_what_was_done_is_said_once_for_each_kind(tmp_path: Path) -> None:

@@ -70,15 +70,6 @@ def test_a_view_without_points_gets_the_median_of_the_others() -> None:
         sampling_rate.median_depths(replace(model, viewmats={5: turned_away}))
 
 
-def test_the_rate_is_focal_length_over_depth() -> None:
-    """300 px at depth 4 are 75 px per unit, and 100 px at depth 2 are 50, which is 2/3 of it."""
-    K = {f: K_of(f, f) for f in (100.0, 300.0)}
-    rates = [sampling_rate.sampling_rate(K[300.0], 4), sampling_rate.sampling_rate(K[100.0], 2)]
-    assert rates == pytest.approx([75, 50])
-    assert sampling_rate.relative_to_largest(rates) == pytest.approx([1, 2 / 3])
-    assert sampling_rate.sampling_rate(K_of(40, 90), 3) == pytest.approx(20)
-
-
 def test_distance_and_sampling_rate_can_disagree() -> None:
     """A far telephoto view has the higher sampling rate, a near wide-angle view the closer one."""
     views = [
@@ -93,17 +84,6 @@ def test_distance_and_sampling_rate_can_disagree() -> None:
     assert relative["sampling_rate"] == pytest.approx([1, np.nan, 2 / 3], nan_ok=True)
     assert relative["distance"] == pytest.approx([0.5, np.nan, 1], nan_ok=True)
     assert relative["megapixels"] == [1, 1, 0.25]
-
-
-def test_points_on_the_border_of_the_image_and_close_to_the_camera_count() -> None:
-    """Pixels 0 and 100 of 100 are the image's own border; depth is bounded by 0 alone."""
-    border = [[-50 / 90, 0, 1], [50 / 90, 0, 1], [0, -40 / 90, 1], [0, 40 / 90, 1]]
-    for point in border:
-        assert sampling_rate.median_depth(np.array([point]), np.eye(4), LENS) == 1
-        assert np.isnan(
-            sampling_rate.median_depth(1.02 * np.array([point]) - [0, 0, 0.02], np.eye(4), LENS)
-        )
-    assert sampling_rate.median_depth(column(0.25, 0.5, 0.75), np.eye(4), LENS) == 0.5
 
 
 def rates_of(*cameras: tuple[float, float], points: np.ndarray) -> np.ndarray:

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from xrgs.config import SceneConf, SfmConf, VariantConf
 from xrgs.mixture import sfm, sfm_retries
@@ -235,18 +234,3 @@ def test_the_lens_of_an_image_for_sfm_is_mapped_to_the_hr_view(
     made = done.model.lenses[1]
     assert (made.width, made.height, made.params) == (500, 340, seen.params)
     assert pytest.approx(np.array([[504, 0, 250], [0, 185 * 340 / 125, 170], [0, 0, 1]])) == made.K
-
-
-def test_exif_gives_the_focal_length_to_begin_with(
-    configured: Make, sfm_conf: SfmConf, tmp_path: Path
-) -> None:
-    """43.27 mm is the diagonal of the film, and so the focal length as long as the diagonal."""
-    exif = Image.Exif()
-    exif.get_ifd(0x8769)[0xA405] = 28
-    for name in ("a", "b"):
-        Image.new("RGB", (400, 300)).save(tmp_path / f"{name}.jpg", exif=exif)
-    files = {name: tmp_path / f"{name}.jpg" for name in ("a", "b")}
-    conf = configured(sfm={"long_side": 200})
-    made = prepare_hr_views(scenes.Scene("x", "", files), conf, tmp_path, for_sfm=True)
-    for image in sfm_retries.sfm_images(made, (), attempt(sfm_conf)):
-        assert image.focal == pytest.approx(250 * 28 / 43.2666, rel=1e-4)

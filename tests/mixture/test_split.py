@@ -62,11 +62,6 @@ def test_another_seed_chooses_other_views_and_holds_out_the_same(configured: Mak
     assert a.hr != b.hr
 
 
-def test_a_uniform_selection_is_evenly_spaced(configured: Make) -> None:
-    conf = configured(selection="uniform", test_every=0, hr_fraction=0.25, min_hr=0)
-    assert split_views(names(16), conf).hr == (2, 6, 10, 14)
-
-
 scored = st.lists(st.floats(0.01, 1), min_size=2, max_size=60, unique=True)
 
 
@@ -135,11 +130,6 @@ def test_an_hr_view_is_a_whole_number_of_lr_pixels_and_never_enlarged(
     left, top = made.crop_offset
     assert abs(made.resized[0] - made.width - 2 * left) <= 1
     assert abs(made.resized[1] - made.height - 2 * top) <= 1
-
-
-def test_a_factor_too_large_for_the_ssim_window_is_named(configured: Make) -> None:
-    with pytest.raises(XrgsError, match=r"variant\.factor=40: LR views of 12x9 px .*SSIM window"):
-        hr_geometry((504, 378), 1.0, configured(factor=40))
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ import pytest
 
 from tests.photos.scene_confs import scene_conf
 from xrgs.config import SceneConf, VariantConf
-from xrgs.errors import UnreadableError, XrgsError
+from xrgs.errors import UnreadableError
 from xrgs.mixture import mixing, variant
 from xrgs.mixture.paths import failed_scenes
 from xrgs.mixture.variant import CorruptVariant
@@ -137,16 +137,6 @@ def test_a_variant_that_cant_be_read_now_is_neither_removed_nor_built_anew(
     assert build(stereo_scene).id == copy.name
 
 
-def test_a_failure_is_forgotten_where_its_report_is_damaged(tmp_path: Path) -> None:
-    assert variant.failure(tmp_path / "nowhere", "key") is None
-    report = tmp_path / "failed-key" / "report.json"
-    report.parent.mkdir()
-    report.write_text('{"scene": "leaves", "reason": "too few"}')
-    assert variant.failure(tmp_path, "key") == "too few"
-    report.write_text("{")
-    assert variant.failure(tmp_path, "key") is None
-
-
 def test_two_processes_at_once_share_one_variant(
     store: Path, made: Path, build: Build, stereo_scene: SceneConf, stereo_variant: Variant
 ) -> None:
@@ -160,14 +150,6 @@ def test_two_processes_at_once_share_one_variant(
     assert made.read_text() == "made\n"
     names = [p.name for p in (store / "variants").iterdir() if p.name[0] != "."]
     assert names == [stereo_variant.id]
-
-
-def test_a_bad_config_is_refused_before_anything_is_made(
-    procedural_scene: SceneConf, build: Build, store: Path
-) -> None:
-    with pytest.raises(XrgsError, match=r"variant\.selection=best"):
-        build(procedural_scene, selection="best")
-    assert not list(store.iterdir())
 
 
 def test_unrelated_photographs_fail_as_a_scene(
@@ -199,13 +181,3 @@ def test_unrelated_photographs_fail_as_a_scene(
     assert report["not_registered"] == ["0", "1", "2", "3", "4"]
     assert "Feature extraction" in (failed / "colmap.log").read_text()
     assert variant.find(variants, key) is None
-
-
-def test_too_few_registered_views_fail_whatever_fraction_is_required(
-    build: Build, tmp_path: Path
-) -> None:
-    images.save(tmp_path / "x" / "a.png", np.zeros((90, 120, 3), np.float32))
-    images.save(tmp_path / "x" / "b.png", np.ones((90, 120, 3), np.float32))
-    scene = scene_conf("folder", tmp_path / "x", name="flat")
-    with pytest.raises(SceneFailed, match="0 HR, 0 LR and 0 test views; at least one of each"):
-        build(scene, sfm={"min_registered": 0.0})

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -45,27 +44,12 @@ def test_every_8th_view_is_held_out_and_a_fraction_of_the_rest_stays_hr(
     assert [(v.split, v.name) for v in made.views] == sorted((v.split, v.name) for v in made.views)
 
 
-def test_images_have_the_size_of_their_tag(procedural_variant: Variant) -> None:
-    for view in procedural_variant.views:
-        expected = (250, 185) if view.tag == "HR" else (50, 37)
-        assert (view.width, view.height) == expected
-        assert images.size(view.file) == expected
-
-
 def test_the_cameras_are_the_exact_ones_up_to_a_similarity(procedural_variant: Variant) -> None:
     """At 250 px, 0.8% and 0.17 degrees were measured; all HR, intrinsics known, gives 0.46%."""
     error = procedural_variant.report["pose_error"]
     assert procedural_variant.report["registered"] == 16
     assert error["position_percent"] < 1.5
     assert error["rotation_degrees"] < 0.4
-
-
-def test_an_lr_camera_is_the_hr_camera_at_a_fifth_of_the_size(procedural_variant: Variant) -> None:
-    high = select(procedural_variant, "train", "HR")[0]
-    low = select(procedural_variant, "train", "LR")[0]
-    small, _ = project(procedural_variant.points, low)
-    large, _ = project(procedural_variant.points, replace(low, K=high.K))
-    assert small * 5 == pytest.approx(large, abs=1e-6)
 
 
 def test_points_have_the_colour_of_the_pixels_they_project_to(procedural_variant: Variant) -> None:
@@ -80,15 +64,6 @@ def test_points_have_the_colour_of_the_pixels_they_project_to(procedural_variant
         shown, expected = photo[row, column], made.colors[inside] / 255
         other = np.random.default_rng(0).permutation(expected)
         assert np.median(np.abs(shown - expected)) < 0.5 * np.median(np.abs(shown - other))
-
-
-def test_rho_is_the_sampling_rate_over_the_largest(procedural_variant: Variant) -> None:
-    rho = {(view.split, view.name): view.sampling_rate for view in procedural_variant.views}
-    assert max(rho.values()) == 1
-    for view in select(procedural_variant, "train", "LR"):
-        assert view.sampling_rate == pytest.approx(rho["original", view.name] / 5)
-    report = procedural_variant.report["rho"]
-    assert 0 < report["LR"][0] < report["LR"][2] <= 0.2 + 1e-9 < report["HR"][0] <= 1
 
 
 def test_the_report_says_how_sfm_went(procedural_variant: Variant) -> None:

@@ -390,21 +390,6 @@ def test_numbers_that_are_not_known_are_refused(
         images.decode(tmp_path / "a.png")
 
 
-@pytest.mark.parametrize("suffix", [".heic", ".avif"])
-def test_full_and_narrow_range_are_the_same_picture(tmp_path: Path, suffix: str) -> None:
-    """The two containers have YUV of either range, which their decoders read."""
-    pillow_heif.register_heif_opener()
-    flags: list[dict[str, Any]] = [{"full_range_flag": 1}, {"full_range_flag": 0}]
-    if suffix == ".avif":
-        flags = [{"range": "full", "subsampling": "4:4:4"}, {"range": "limited"}]
-    for i, flag in enumerate(flags):
-        more = {"chroma": 444} | flag if suffix == ".heic" else flag
-        picture = Image.fromarray(np.full((64, 64, 3), (235, 128, 16), np.uint8))
-        picture.save(tmp_path / f"{i}{suffix}", quality=100, **more)
-        pixels = images.decode(tmp_path / f"{i}{suffix}").pixels[32, 32] * 255
-        assert np.abs(pixels - (235, 128, 16)).max() <= 3
-
-
 @pytest.mark.parametrize(("primaries", "transfer"), [(12, 13), (1, 5), (9, 16)])
 def test_avif_names_its_colours_by_number(tmp_path: Path, primaries: int, transfer: int) -> None:
     Image.fromarray(smooth()).save(tmp_path / "a.avif", quality=100, subsampling="4:4:4")

@@ -133,20 +133,6 @@ def test_exif_behind_the_pixels_of_a_png_is_found(tmp_path: Path) -> None:
         images.read(tmp_path / "a.png")
 
 
-def test_the_header_of_a_png_is_read_without_its_pixels(tmp_path: Path) -> None:
-    content = png(np.zeros((40, 60, 3)), bits=8)
-    (tmp_path / "a.png").write_bytes(content[:-40])
-    assert images.size(tmp_path / "a.png") == (60, 40)
-    with pytest.raises(ImageError, match=r"a\.png: unreadable or truncated"):
-        images.decode(tmp_path / "a.png")
-
-
-@pytest.mark.parametrize("mode", ["LA", "P", "1"])
-def test_any_8_bit_photograph_is_read_as_rgb(tmp_path: Path, mode: str) -> None:
-    Image.new(mode, (20, 10)).save(tmp_path / "a.tif")
-    assert images.read(tmp_path / "a.tif").shape == (10, 20, 3)
-
-
 def test_a_file_that_is_no_image_is_named(tmp_path: Path) -> None:
     (tmp_path / "a.png").write_text("hello")
     with pytest.raises(ImageError, match=r"a\.png"):

@@ -178,14 +178,6 @@ def test_a_mask_that_may_be_a_photograph_is_said(tmp_path: Path) -> None:
     assert photos.notes == (f"{said}: a.png",)
 
 
-@pytest.mark.parametrize("size", [(50, 34), (7, 5)])
-def test_a_mask_of_another_scale_may_have_a_rounded_side(
-    tmp_path: Path, size: tuple[int, int]
-) -> None:
-    file = save(tmp_path / "a.png", np.full((size[1], size[0]), 255, np.uint8))
-    assert read(file, save(tmp_path / "photo.png", noise((60, 40)))).shape == (40, 60)
-
-
 @pytest.mark.parametrize("size", [(40, 60), (60, 38)])
 def test_a_mask_of_another_shape_is_refused_by_name(tmp_path: Path, size: tuple[int, int]) -> None:
     file = save(tmp_path / "a.png", np.zeros((size[1], size[0]), np.uint8))
@@ -340,15 +332,6 @@ def test_what_is_hidden_changes_no_bit_of_what_is_trained_and_scored(
         assert one.mask(kind, 1) is None
     hidden_now = one.undistorted("hr", 0, LENS)
     assert alpha or (hidden_now[0] != other.undistorted("hr", 0, LENS)[0]).any()
-
-
-def test_under_its_mask_an_hr_view_shows_the_photograph(tmp_path: Path) -> None:
-    photograph = noise((60, 40), 7)
-    photos = prepared(tmp_path / "x", photograph, USED)
-    image, used = photos.undistorted("hr", 0, Lens("PINHOLE", (50.0, 50.0, 30.0, 20.0), 60, 40))
-    assert used is not None
-    assert (used == USED).all()
-    assert (images.to_8_bit(image)[~used] == photograph[~used]).all()
 
 
 def test_a_mask_that_hides_nothing_changes_no_bit(tmp_path: Path) -> None:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import resource
-import sys
 from pathlib import Path
 
 import psutil
@@ -15,23 +13,10 @@ import torch
 from xrgs.runtime import machine
 from xrgs.runtime.machine import (
     gpus,
-    peak_rss,
     set_portable_blas,
     single_torch_thread,
     usable_cores,
 )
-
-
-def test_the_cores_are_those_of_the_affinity() -> None:
-    if not hasattr(os, "sched_getaffinity"):
-        pytest.skip("the system has no processor affinity")
-    allowed = os.sched_getaffinity(0)
-    try:
-        os.sched_setaffinity(0, {min(allowed)})
-        assert usable_cores() == 1
-    finally:
-        os.sched_setaffinity(0, allowed)
-    assert usable_cores() <= len(allowed)
 
 
 @pytest.mark.parametrize(("given", "cores"), [("1", 1), ("0", 1), ("default", None)])
@@ -154,18 +139,6 @@ def test_openblas_has_the_kernels_of_avx2_wherever_there_is_avx2(
     monkeypatch.setenv("OPENBLAS_CORETYPE", "Zen")
     set_portable_blas(cpuinfo)
     assert os.environ["OPENBLAS_CORETYPE"] == "Zen"
-
-
-@pytest.mark.parametrize(("platform", "unit"), [("linux", 1024), ("darwin", 1)])
-def test_the_peak_memory_is_in_bytes(
-    platform: str, unit: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    class Usage:
-        ru_maxrss = 300_000
-
-    monkeypatch.setattr(sys, "platform", platform)
-    monkeypatch.setattr(resource, "getrusage", lambda *_: Usage)
-    assert peak_rss() == 300_000 * unit
 
 
 @pytest.mark.parametrize(

@@ -34,11 +34,6 @@ def test_a_log_gets_lines_and_no_carriage_return(capsys: pytest.CaptureFixture[s
     assert lines[-1].startswith("reading 3 of 3 letters, ")
 
 
-def test_a_log_gets_no_line_of_short_work(capsys: pytest.CaptureFixture[str]) -> None:
-    assert len(list(progress.progress(range(100_000), "counting", "number"))) == 100_000
-    assert capsys.readouterr().err == ""
-
-
 @pytest.mark.usefixtures("quick")
 def test_a_terminal_gets_a_bar_that_is_cleared_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
     terminal = Terminal()
@@ -78,17 +73,6 @@ def test_progress_in_a_file_is_shown_nowhere_and_removed_at_the_end(
     with pytest.raises(ZeroDivisionError), written_to(file):
         [1 / number for number in progress.progress([1, 0], "training", "step")]
     assert not list(tmp_path.iterdir())
-
-
-def test_the_file_is_not_written_for_every_item(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    written: list[int] = []
-    monkeypatch.setattr(progress, "_write", lambda _, now: written.append(now.done))
-    with written_to(tmp_path / "progress.json"):
-        assert sum(progress.progress(range(10_000), "training", "step")) == 49_995_000
-    assert written[0] == 0
-    assert len(written) < 3
 
 
 @pytest.mark.parametrize(

@@ -103,20 +103,6 @@ with open("file", "w") as file:
     assert (done.stdout, done.stderr) == ("" if 1 in closed else said, "" if 2 in closed else said)
 
 
-def test_text_is_printed_whatever_the_encoding_of_the_stream(tmp_path: Path) -> None:
-    script = (
-        "import sys\n"
-        "from xrgs.runtime.streams import guard_streams\n"
-        "guard_streams()\n"
-        "print('é ┃')\n"  # as help and bars, which do not go through `say`
-        "print('é ┃', file=sys.stderr)\n"
-    )
-    environment = os.environ | {"PYTHONIOENCODING": "ascii:strict"}
-    command = [sys.executable, "-c", script]
-    done = subprocess.run(command, capture_output=True, env=environment, check=True)
-    assert done.stdout == done.stderr == b"\\xe9 \\u2503\n"
-
-
 def test_a_terminal_that_draws_over_nothing_gets_lines(monkeypatch: pytest.MonkeyPatch) -> None:
     class Terminal(io.StringIO):
         def isatty(self) -> bool:

@@ -7,7 +7,6 @@ from xrgs.runtime.text import (
     format_age,
     format_duration,
     format_size,
-    listed,
     to_text,
     width,
 )
@@ -36,8 +35,3 @@ def test_wide_characters_keep_the_columns() -> None:
     table = TextTable("t", ("a", "b"), (("部屋", "1"), ("cafe\u0301", "2"), ("plain", "3")), "lr")
     lines = to_text(table).splitlines()[2:]
     assert len({width(line) for line in lines}) == 1
-
-
-def test_listed_names_say_how_many_are_not_shown() -> None:
-    assert listed(["a", "b"]) == "a, b"
-    assert listed(["a", "b", "c"], most=2) == "a, b and 1 more"

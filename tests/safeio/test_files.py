@@ -62,17 +62,6 @@ def test_only_regular_files_are_read(root: Path, kind: str) -> None:
     assert not is_transient(raised.value)
 
 
-@pytest.mark.parametrize(
-    ("number", "passes"),
-    [(errno.EACCES, True), (errno.EIO, True), (errno.EMFILE, True), (errno.ENOENT, False)],
-)
-def test_an_error_that_may_pass_is_told_from_one_that_is_conclusive(
-    number: int, passes: bool
-) -> None:
-    assert is_transient(OSError(number, os.strerror(number))) == passes
-    assert not is_transient(OSError("a library's"))
-
-
 def test_a_walk_has_each_file_and_ends_at_links(root: Path) -> None:
     (root / "a" / "up").symlink_to(root)
     found = {name: status.st_size for name, status in files.walk_files(root / "a")}

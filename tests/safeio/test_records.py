@@ -16,11 +16,9 @@ from msgspec import Meta, Struct
 
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.safeio.records import (
-    MAX_BYTES,
     as_number,
     errors_named,
     list_folder,
-    read_file,
     read_struct,
     read_table,
     table_text,
@@ -106,14 +104,6 @@ def test_a_table_is_read_back_exactly(rows: list[list[str]]) -> None:
     assert header == (["view", "x", "y"] if rows else ["view", "x"])
     assert found[0][:2] == ["=1", "0.1"]
     assert [[row[0], row[2]] for row in found[1:]] == rows
-
-
-def test_a_file_of_exactly_the_bound_is_read_and_a_larger_one_is_named(file: Path) -> None:
-    file.write_bytes(bytes(MAX_BYTES))
-    assert len(read_file(file)) == MAX_BYTES
-    file.write_bytes(bytes(MAX_BYTES + 1))
-    with pytest.raises(StoreError, match=f"file: {MAX_BYTES + 1} bytes, at most {MAX_BYTES}"):
-        read_file(file)
 
 
 def test_a_table_has_at_most_20000_rows_and_1000_columns(file: Path) -> None:

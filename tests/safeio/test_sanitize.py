@@ -12,7 +12,6 @@ from pathlib import Path
 
 import cmarkgfm
 import pyte
-import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
@@ -216,21 +215,6 @@ def test_latex_shows_the_text_and_no_character_is_active(text: str) -> None:
     assert not set("\\{}$&#_%~^<>|[]\n\r") & set(_TOKEN.sub("", escaped))
     shown = _TOKEN.sub(lambda found: _LATEX[found[0]], escaped)
     assert shown == sanitize.for_line(text).strip().replace("−", "-")
-
-
-@pytest.mark.parametrize(
-    ("text", "escaped"),
-    [
-        ("\\", r"\textbackslash{}"),
-        ("x-1", "x-1"),
-        ("-1 to -2", "$-$1 to $-$2"),
-        ("~^", r"\textasciitilde{}\textasciicircum{}"),
-        ("{#}", r"\{\#\}"),
-        ("é ≈ 部屋", r"é $\approx$ \ifdefined\Umathchar 部屋\else U+90E8 U+5C4B\fi{}"),
-    ],
-)
-def test_latex_characters(text: str, escaped: str) -> None:
-    assert sanitize.for_latex(text) == escaped
 
 
 @given(TEXTS)

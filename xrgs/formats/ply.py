@@ -188,8 +188,7 @@ def _properties(rest: int) -> list[str]:
 def _columns(path: Path, names: Sequence[str]) -> list[str]:
     """Return the names of the file's properties for all parameters, in the order of `_properties`.
 
-    Raises:
-        XrgsError: Properties are missing; the message says what kind of file it seems to be.
+    If some are missing, XrgsError says what kind of file it seems to be.
     """
     if "packed_position" in names:
         raise XrgsError(

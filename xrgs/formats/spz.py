@@ -73,15 +73,9 @@ def write_spz(path: Path, gaussians: Gaussians, *, antialiased: bool = False) ->
     outside -1..1, coordinates beyond 8 million. The file has the axes of the Gaussians' world,
     without rotation.
 
-    Args:
-        path: The file to write.
-        gaussians: The Gaussians.
-        antialiased: Whether to render them with `RasterSettings.antialiased`.
-
     Raises:
         XrgsError: A parameter is NaN, or a position, quaternion or coefficient is infinite; the
             message names it.
-        OSError: The file can't be written.
     """
     means, scales, sh0, shN = (
         value.detach().double().numpy()

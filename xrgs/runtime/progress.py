@@ -175,8 +175,7 @@ def _write(file: Path, state: Progress) -> None:
 def written_to(file: Path) -> Iterator[ProgressFile]:
     """Keep the latest state of the latest bar of a block in a file, and show no bar.
 
-    Yields:
-        The file, with a note that can be set. It is removed at the end.
+    The file that is yielded has a note that can be set. It is removed at the end.
     """
     target = ProgressFile(file)
     token = _file.set(target)

@@ -252,23 +252,3 @@ def test_binary_files_are_preferred_and_a_model_may_have_no_points(tmp_path: Pat
     assert len(colmap.read(folder).points) == 0
     (folder / "images.bin").unlink()
     assert colmap.files(folder) == []
-
-
-def test_the_names_of_a_model_may_begin_with_that_of_the_project(tmp_path: Path) -> None:
-    folder = write_colmap(tmp_path / "a")
-    plain = colmap.read(folder)
-    for file in list(folder.iterdir()):
-        file.rename(folder / f"My Project - {file.name.replace('3D', '3d')}")
-    found = colmap.read(folder)
-    assert list(found.names) == list(plain.names)
-    assert np.array_equal(found.points, plain.points)
-
-
-def test_points_beside_a_model_may_be_in_a_ply(tmp_path: Path) -> None:
-    folder = write_colmap(tmp_path / "a")
-    plain = colmap.read(folder)
-    pycolmap.Reconstruction(folder).export_PLY(folder / "points3D.ply")
-    (folder / "points3D.bin").unlink()
-    found = colmap.read(folder)
-    assert np.allclose(np.sort(found.points, axis=0), np.sort(plain.points, axis=0), atol=1e-6)
-    assert not any(len(indices) for indices in found.observed.values())

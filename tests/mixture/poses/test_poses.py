@@ -175,21 +175,6 @@ def test_names_that_fit_nothing_or_alike_are_refused() -> None:
         poses.match_names(["x/a.jpg", "y/a.jpg"], [("a", Path("a.png"))])
 
 
-def test_poses_without_a_photograph_are_named(photos: PhotoCollection, tmp_path: Path) -> None:
-    path = write_colmap(tmp_path / "poses", names=("a.jpg", "b.jpg", "z.jpg"))
-    assert poses.read_poses(str(path), photos).report["notes"] == [
-        "1 poses fit no photograph, or several: z.jpg",
-    ]
-
-
-def test_what_is_not_there_is_named(tmp_path: Path) -> None:
-    with pytest.raises(XrgsError, match=r"poses=.*/gone: no such folder or file"):
-        poses.fingerprint(str(tmp_path / "gone"))
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(XrgsError, match=r"cameras, images and points3D.*sparse/0"):
-        poses.fingerprint(str(tmp_path / "empty"))
-
-
 def test_masks_of_a_file_are_those_of_the_photographs(tmp_path: Path) -> None:
     path = str(write_transforms(tmp_path / "poses", {}, {"mask_path": "m.png"}))
     scene = Scene("x", "", {name: tmp_path / f"{name}.png" for name in ("a", "b", "z")})

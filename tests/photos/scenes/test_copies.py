@@ -119,28 +119,6 @@ def test_of_the_sizes_of_an_llff_scene_one_is_taken(
         )
 
 
-def test_copies_of_the_sizes_that_are_not_taken_are_left_out(tmp_path: Path) -> None:
-    shoot(tmp_path / "images")
-    shoot(tmp_path / "images_2", size=(80, 60))
-    for number in range(6):
-        backup = tmp_path / "backup" / f"photo {number}.jpg"
-        backup.parent.mkdir(exist_ok=True)
-        shutil.copy(tmp_path / "images" / f"IMG_{number}.jpg", backup)
-    found = below(tmp_path, 80)
-    assert {file.parent.name for file in found.files.values()} == {"images_2"}
-    assert "backup/photo 0.jpg (of images/IMG_0.jpg)" in found.notes[1]
-
-
-def test_folders_that_are_numbered_and_of_one_size_are_no_copies(tmp_path: Path) -> None:
-    for number in range(1, 4):
-        shoot(tmp_path / f"images_{number}", first=10 * number)
-    found = below(tmp_path)
-    assert len(found.files) == 18
-    assert not found.notes
-    with pytest.raises(Exception, match=r"no image in it.*6 in images_1, 6 in images_2"):
-        folder.look(str(tmp_path), 0)
-
-
 @pytest.mark.parametrize("fault", ["missing", "truncated"])
 def test_sizes_that_lack_photographs_are_not_taken(tmp_path: Path, fault: str) -> None:
     shoot(tmp_path / "images")
@@ -154,13 +132,6 @@ def test_sizes_that_lack_photographs_are_not_taken(tmp_path: Path, fault: str) -
     for found in (below(tmp_path, 80), folder.look(str(tmp_path), 80)):
         assert {file.parent.name for file in found.files.values()} == {"images"}
         assert "images_2 has 4 of the 6 photographs of images" in found.notes[0]
-
-
-def test_photographs_with_films_behind_them_are_whole(tmp_path: Path) -> None:
-    for file in shoot(tmp_path / "images").iterdir():
-        file.write_bytes(file.read_bytes() + bytes(5000))
-    shoot(tmp_path / "images_2", size=(80, 60))
-    assert folder.look(str(tmp_path), 0).files["IMG_0"].parent.name == "images"
 
 
 def test_a_store_and_all_that_xrgs_writes_are_left_out(tmp_path: Path) -> None:
@@ -197,12 +168,6 @@ def test_pngs_of_xrgs_beside_photographs_are_left_out(tmp_path: Path) -> None:
     assert found.notes == (
         "3 images left out, which xrgs made: day/k-1.png, film/0000.png, film/0001.png",
     )
-
-
-def test_a_folder_of_renders_alone_is_taken(tmp_path: Path) -> None:
-    for number in range(2):
-        images.save(tmp_path / f"{number}.png", np.full((30, 40, 3), number, np.float32))
-    assert len(folder.look(str(tmp_path), 0).files) == 2
 
 
 @pytest.mark.parametrize("name", ["Mask", "person_masks", "segmentation"])
@@ -249,31 +214,11 @@ def test_of_photographs_and_what_colmap_undistorted_the_photographs_are_taken(
     assert "6 in images, 6 in images_2 (copies that COLMAP undistorted)" in found.notes[0]
 
 
-def test_folders_of_the_system_are_left_out(tmp_path: Path) -> None:
-    shoot(tmp_path / "day")
-    shoot(tmp_path / "@eaDir" / "IMG_0.jpg", 2, first=40)
-    shoot(tmp_path / ".thumbnails", first=50)
-    (tmp_path / "day" / "._IMG_0.jpg").write_bytes(b"AppleDouble")
-    found = below(tmp_path)
-    assert names(tmp_path, found) == [f"day/{name}" for name in ORIGINALS]
-    assert found.notes == ("images left out: 2 in @eaDir (folders of the system)",)
-
-
 def test_a_photograph_that_was_edited_is_taken_once(tmp_path: Path) -> None:
     shoot(tmp_path)
     for name, number in (("IMG_E1.jpg", 1), ("IMG_2-edited.jpg", 2)):
         ImageEnhance.Brightness(picture(number)).enhance(0.9).save(tmp_path / name)
     assert names(tmp_path, folder.look(str(tmp_path), 0)) == ORIGINALS
-
-
-def test_dark_photographs_of_one_name_stay(tmp_path: Path) -> None:
-    for day in range(2):
-        for number in range(3):
-            file = tmp_path / f"night{day}" / f"{number}.png"
-            file.parent.mkdir(exist_ok=True)
-            dark = ImageEnhance.Brightness(picture(10 * day + number)).enhance(0.02)
-            dark.resize((160 - 40 * day, 120 - 30 * day)).save(file)
-    assert len(below(tmp_path).files) == 6
 
 
 @pytest.mark.parametrize("readable", [True, False])
@@ -312,15 +257,6 @@ def test_neighbouring_views_of_two_cameras_and_of_a_burst_stay(
         assert len(below(tmp_path / part).files) == 12
     (tmp_path / "web").rename(tmp_path / "rig" / "web")
     assert len(below(tmp_path / "rig").files) == 12
-
-
-def test_raw_files_and_films_of_the_photographs_names_are_said_once(tmp_path: Path) -> None:
-    shoot(tmp_path)
-    for name in ("IMG_0.DNG", "IMG_1.MOV", "IMG_2.ARW"):
-        (tmp_path / name).write_bytes(b"content")
-    assert folder.look(str(tmp_path), 0).notes == (
-        "not read, beside photographs of the same names: IMG_1.MOV, IMG_0.DNG, IMG_2.ARW",
-    )
 
 
 def test_panoramas_are_left_out_and_screenshots_are_named(tmp_path: Path) -> None:

@@ -24,35 +24,6 @@ def scene_of(path: object) -> SceneConf:
     return scene_conf("folder", path)
 
 
-@pytest.mark.parametrize(("long_side", "width"), [(0, 400), (50, 50), (51, 100), (999, 400)])
-def test_an_llff_scene_gives_the_smallest_copies_that_suffice(
-    fill: Fill, tmp_path: Path, long_side: int, width: int
-) -> None:
-    for folder, size in {"images": 400, "images_4": 100, "images_8": 50}.items():
-        fill(tmp_path / folder, "a.png", "b.png", size=(size, size * 3 // 4))
-    (tmp_path / "poses_bounds.npy").write_bytes(b"never read")
-    scene = scenes.resolve(
-        scene_of(tmp_path),
-        tmp_path,
-        long_side,
-    )
-    assert images.size(next(iter(scene.files.values())))[0] == width
-
-
-def test_copies_are_measured_by_their_largest_photograph(fill: Fill, tmp_path: Path) -> None:
-    """Where sizes differ the first alone tells little; what can't be read tells nothing."""
-    fill(tmp_path / "images", "a.png", "b.png", size=(400, 300))
-    fill(tmp_path / "images_4", "a.png", size=(60, 45))
-    fill(tmp_path / "images_4", "b.png", size=(100, 75))
-    (tmp_path / "images_4" / "c.png").write_text("no image")
-    scene = scenes.resolve(
-        scene_of(tmp_path),
-        tmp_path,
-        100,
-    )
-    assert next(iter(scene.files.values())).parent.name == "images_4"
-
-
 @pytest.mark.parametrize(
     ("names", "message"),
     [
@@ -82,6 +53,10 @@ def test_a_missing_folder_or_path_names_the_key(tmp_path: Path) -> None:
             scene_of(tmp_path / "nowhere"),
             tmp_path,
         )
+    for file, what in {"a.zip": "an archive", "a.mp4": "a video", "a.xml": "Metashape"}.items():
+        (tmp_path / file).touch()
+        with pytest.raises(XrgsError, match=rf"{what}.*, not a folder; "):
+            scenes.fingerprint(scene_of(tmp_path / file))
     with pytest.raises(XrgsError, match=r"scene\.path is empty"):
         scenes.resolve(scene_conf("folder", name="x"), tmp_path)
 
@@ -138,13 +113,6 @@ def test_all_folders_below_are_taken_where_the_path_asks_for_them(
     assert scenes.fingerprint(nested) != scenes.fingerprint(flat)
 
 
-def test_names_that_nested_folders_share_are_refused(fill: Fill, tmp_path: Path) -> None:
-    fill(tmp_path / "x" / "a_b", "c.png")
-    fill(tmp_path / "x" / "a", "b_c.png", size=(44, 30))
-    with pytest.raises(XrgsError, match=r"two images of one name"):
-        scenes.fingerprint(scene_of(f"{tmp_path / 'x'}/**"))
-
-
 def test_photographs_whose_names_can_not_be_used_are_left_out_by_name(
     fill: Fill, tmp_path: Path
 ) -> None:
@@ -181,16 +149,6 @@ def test_what_is_nested_too_deep_is_left_out_by_name(fill: Fill, tmp_path: Path)
     assert scene.notes == (left_out,)
     flat = scenes.resolve(fill(tmp_path / "x", "t.png", "u.png"), tmp_path)
     assert flat.notes[1:] == (left_out,)
-
-
-def test_grey_photographs_among_those_in_colour_are_named(fill: Fill, tmp_path: Path) -> None:
-    folder = tmp_path / "x"
-    conf = fill(folder, "a.jpg", "b.jpg", "c.jpg")
-    for name in ("b.jpg", "c.jpg"):
-        Image.open(folder / name).convert("L").save(folder / name)
-    assert scenes.resolve(conf, tmp_path).notes == ("grey, where others have colour: b.jpg, c.jpg",)
-    (folder / "a.jpg").unlink()
-    assert scenes.resolve(conf, tmp_path).notes == ()
 
 
 def test_what_is_not_read_is_named(fill: Fill, tmp_path: Path) -> None:
@@ -258,45 +216,6 @@ def test_a_grey_map_of_16_bits_is_not_cut(tmp_path: Path) -> None:
     truth = values.reshape(3, 4, 1).astype(np.float64) / 65535
     assert np.abs(images.read(tmp_path / "a.pgm") - truth).max() < 1e-6
     assert images.header(tmp_path / "a.pgm").bits == 16
-
-
-@pytest.mark.parametrize(
-    ("name", "content"),
-    [
-        ("IMG_1.exr", b"content"),
-        ("IMG_1", b"GIF89a" + bytes(20)),
-        ("IMG_1.raw16", b"II*\0" + bytes(20)),
-    ],
-)
-def test_images_that_are_not_read_are_named(
-    fill: Fill, tmp_path: Path, name: str, content: bytes
-) -> None:
-    fill(tmp_path, "a.jpg", "b.jpg")
-    (tmp_path / name).write_bytes(content)
-    (tmp_path / "notes.txt").write_text("no image")
-    (tmp_path / "README").write_text("no image")
-    found = scenes_folder.look(str(tmp_path), 0)
-    assert [*found.files] == ["a", "b"]
-    why = f"images left out: 1 of a format that is not read ({name}); convert them to PNG or JPEG"
-    assert found.notes == (why,)
-
-
-@pytest.mark.parametrize(
-    ("name", "what"),
-    [
-        ("a.zip", "an archive (.zip), not a folder; unpack it"),
-        ("a.mp4", "a video, not a folder; scene=video takes its frames"),
-        (
-            "a.xml",
-            "as Metashape's cameras are, not a folder; give the folder that the photographs are in",
-        ),
-    ],
-)
-def test_a_file_in_place_of_the_folder_is_named(tmp_path: Path, name: str, what: str) -> None:
-    (tmp_path / name).write_bytes(b"content")
-    with pytest.raises(XrgsError) as caught:
-        scenes_folder.look(str(tmp_path / name), 0)
-    assert what in str(caught.value)
 
 
 @pytest.mark.parametrize(

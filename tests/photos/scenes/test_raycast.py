@@ -96,12 +96,6 @@ def test_the_nearer_solid_hides_the_farther_whatever_their_order(
     assert torch.equal(image, alone)
 
 
-def test_a_solid_behind_the_camera_is_not_shown(K: torch.Tensor, ramps: Textures) -> None:
-    u, v = torch.tensor([8.0, 0, 0]), torch.tensor([0, 8.0, 0])
-    behind = Quad("white", torch.tensor([-4.0, -4.0, -3.0]), u, v)
-    assert render([behind], ramps, K, torch.eye(4), W, H, 1).max() == 0
-
-
 def test_a_third_covered_pixel_is_a_third_bright(ramps: Textures) -> None:
     K = torch.tensor([[F, 0, 40.0], [0, F, 30.0], [0, 0, 1]])
     # At z = F a unit is a pixel: the sheet ends a third into the pixel of column 50.

@@ -93,17 +93,6 @@ def test_a_scene_that_cant_be_read_now_is_not_rendered_over(
     assert render.count == 0
 
 
-def test_verifying_names_every_file(home: Path) -> None:
-    (home / "a.png").unlink()
-    (home / "b.png").write_text("changed")
-    (home / "c.png").write_text("new")
-    assert rendered.verify(home) == [
-        f"{home}/a.png: No such file or directory",
-        f"{home}/b.png: it has changed since it was written",
-        f"{home}/c.png: it does not belong there",
-    ]
-
-
 def test_an_interrupted_rendering_leaves_no_scene(tmp_path: Path) -> None:
     home = tmp_path / "scenes/0123456789abcdef"
     leftover = tmp_path / "scenes" / ".0123456789abcdef.rendering" / "a.png"

@@ -55,11 +55,6 @@ def test_the_fingerprint_follows_names_and_bytes_alone(fill: Fill, tmp_path: Pat
     assert scenes.fingerprint(conf) != first
 
 
-def test_an_unknown_kind_names_the_key(tmp_path: Path) -> None:
-    with pytest.raises(XrgsError, match=r"scene.kind=llff: must be one of procedural"):
-        scenes.resolve(scene_conf("llff", tmp_path, name="x"), tmp_path)
-
-
 def test_the_procedural_scene_is_rendered_once(tmp_path: Path) -> None:
     first = scenes.resolve(PROCEDURAL, tmp_path, 60)
     assert stems(first) == ["view_000", "view_001", "view_002"]

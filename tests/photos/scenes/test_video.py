@@ -125,15 +125,6 @@ def test_the_sharpest_frame_of_each_part_is_taken(tmp_path: Path) -> None:
     assert scene.name == "a.mp4"
 
 
-def test_the_identity_is_the_content_and_the_number_of_frames(tmp_path: Path) -> None:
-    write_video(tmp_path / "a.mp4", [textured(90, 0), textured(99, 0), textured(80, 0)])
-    (tmp_path / "b.mov").write_bytes((tmp_path / "a.mp4").read_bytes())
-    write_video(tmp_path / "c.mp4", [textured(91, 0), textured(99, 0), textured(80, 0)])
-    keys = [scenes.fingerprint(conf(tmp_path / name, 2)) for name in ("a.mp4", "b.mov", "c.mp4")]
-    assert keys[0] == keys[1]
-    assert len({*keys, scenes.fingerprint(conf(tmp_path / "a.mp4", 3))}) == 3
-
-
 def test_a_video_held_upright_is_turned_as_a_player_does(tmp_path: Path) -> None:
     frame = textured(60, 0)
     frame[:, : WIDTH // 2] = 200  # bright on the left; a quarter turn clockwise puts it on top
@@ -170,24 +161,6 @@ def test_colours_are_converted_to_srgb(
     assert np.abs(middles - PATCHES).max() <= 4  # 8 bits of YUV, and of RGB in between
 
 
-def test_the_colours_of_large_videos_that_name_none_are_those_that_players_take(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """BT.709's from 720 rows on, as in Chromium, and BT.601's below."""
-    middles = []
-    for height in (718, 720):
-        monkeypatch.setattr(f"{__name__}.HEIGHT", height)
-        write_video(
-            tmp_path / f"{height}.mkv",
-            [patches(TO_SRGB, BT709 if height >= 720 else BT601)] * 2,
-            "ffv1",
-            ("yuv420p", "yuv420p"),
-        )
-        scene = scenes.resolve(conf(tmp_path / f"{height}.mkv", 2), tmp_path / str(height))
-        middles.append(images.read(scene.files["frame_0000"])[height // 2, 8::16] * 255)
-    assert np.abs(np.array(middles) - PATCHES).max() <= 4
-
-
 def moving(frames: int) -> list[NDArray[np.uint8]]:
     """Frames of smooth waves that move by three pixels each."""
     y, x = np.mgrid[:HEIGHT, : WIDTH + 3 * frames]
@@ -218,18 +191,6 @@ def test_interlaced_frames_are_shown_deinterlaced(tmp_path: Path, first: int, fl
         errors = [np.abs(shown - field[4:-4, 4:-4]).mean() for field in fields]
         assert min(errors) < 4, number
         assert np.argmin(errors) // 2 == number
-
-
-def test_a_sharp_frame_is_taken_before_a_combed_one(tmp_path: Path) -> None:
-    fields = moving(40)
-    blurred = [(frame // 2 + 64).astype(np.uint8) for frame in fields]
-    frames = woven(blurred, 0)
-    frames[7::10] = fields[14::20]
-    options = {"crf": "6", "x264-params": "tff=1:interlaced=1"}
-    write_video(tmp_path / "a.mp4", frames, "libx264", options=options)
-    scene = scenes.resolve(conf(tmp_path / "a.mp4", 2), tmp_path)
-    contrast = [images.read(file).std() for file in scene.files.values()]
-    assert min(contrast) > 1.5 * blurred[0].std() / 255
 
 
 @pytest.mark.parametrize("step", [0, 3])
@@ -277,15 +238,6 @@ def test_a_disc_of_oblong_pixels_is_shown_round(
         assert across @ position / across.sum() == pytest.approx(0, abs=0.1)
         # The mean square of a coordinate in a disc is a quarter of its squared radius.
         assert across @ position**2 / across.sum() == pytest.approx(24**2 / 4, rel=0.03)
-
-
-def test_the_aspect_may_be_in_the_stream_alone(tmp_path: Path) -> None:
-    write_video(tmp_path / "a.mp4", [disc(24, Fraction(2))] * 2, aspect=Fraction(2))
-    content = (tmp_path / "a.mp4").read_bytes()
-    assert content.count(b"pasp") == 1
-    (tmp_path / "a.mp4").write_bytes(content.replace(b"pasp", b"free"))
-    scene = scenes.resolve(conf(tmp_path / "a.mp4", 2), tmp_path)
-    assert images.size(scene.files["frame_0000"]) == (2 * WIDTH, HEIGHT)
 
 
 def test_frames_that_are_too_large_once_pixels_are_square_are_refused(
