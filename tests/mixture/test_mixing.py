@@ -370,36 +370,3 @@ def test_given_poses_replace_sfm_and_are_scaled_for_lr_views(
         assert scale in {1, 1 / 5}
         assert np.allclose(view.K, np.diag([scale, scale, 1]) @ exact, atol=1e-9)
     assert {v.name for v in of(made, "train", "LR")} == set(made.report["lr"]) - {names[-1]}
-
-
-# real photographs
-
-
-@pytest.mark.data
-def test_a_collection_of_many_cameras_is_registered(
-    configured: Make, data_root: Path, tmp_path: Path
-) -> None:
-    """Photographs of as many tourists, all of differing sizes, at a quarter of these."""
-    source = data_root / "captures" / "reichstag" / "images"
-    if not source.is_dir():
-        pytest.skip(f"{source} is not there")
-    files = tuple(sorted(source.iterdir())[:16])
-    sizes = [images.size(file) for file in files]
-    few = {"max_num_features": 1500, "long_side": 640}
-    conf = configured(long_side=320, tags="sampling_rate", factor=2, sfm=few)
-    (tmp_path / "out/images").mkdir(parents=True)
-    made = mixing.mix_resolutions(
-        Scene("reichstag", "", {file.stem: file for file in files}),
-        conf,
-        tmp_path,
-        tmp_path / "out",
-    )
-    assert made.report["registered"] >= 12
-    assert made.report["cameras"] == 16
-    scale = 320 / max(max(size) for size in sizes)
-    by_name = dict(zip((file.stem for file in files), sizes, strict=True))
-    for view in made.views:
-        width, height = by_name[view.name]
-        assert 0 <= round(width * scale) - view.width < 2
-        assert 0 <= round(height * scale) - view.height < 2
-    assert min(view.sampling_rate for view in made.views) < 0.8  # 0.72 when this was written

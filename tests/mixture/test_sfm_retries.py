@@ -198,29 +198,6 @@ def test_small_images_are_upsampled_or_have_a_camera_of_their_own(
     assert native_K[:2] * 5 == pytest.approx(upsampled_K[:2], rel=0.01)
 
 
-def test_photographs_that_are_smaller_from_the_start_are_upsampled_for_one_camera(
-    configured: Make, sfm_conf: SfmConf, tmp_path: Path
-) -> None:
-    """With the size of the trained views, and of SfM, smaller than the photographs."""
-    sizes = [(400, 300), (81, 61), (400, 300), (81, 61)] * 4 + [(200, 300)]
-    for i, (width, height) in enumerate(sizes):
-        images.save(tmp_path / f"IMG_{i:02d}.png", np.full((height, width, 3), 0.5, np.float32))
-    files = {file.stem: file for file in sorted(tmp_path.iterdir())}
-    conf = configured(long_side=300, factor=2, sfm={"long_side": 200})
-    made = prepare_hr_views(scenes.Scene("x", "", files), conf, tmp_path, for_sfm=True)
-    given = sfm_retries.sfm_images(made, (), attempt(sfm_conf))
-    assert [image.name for image in given] == list(files)
-    assert [made.size("sfm", i) for i in (0, 1, 16)] == [(200, 150), (40, 30), (100, 150)]
-    wanted = {(400, 300): (200, 150), (81, 61): (200, 150), (200, 300): (100, 150)}
-    assert [images.size(tmp_path / image.file) for image in given] == [wanted[s] for s in sizes]
-    # Without EXIF, a size that several photographs have is a camera's.
-    cameras = [image.camera for image in given]
-    assert len(set(cameras)) == 3
-    assert cameras[:2] * 8 == cameras[:16]
-    native = sfm_retries.sfm_images(made, (), attempt(replace(sfm_conf, lr_images="native")))
-    assert images.size(tmp_path / native[1].file) == (40, 30)
-
-
 def test_the_lens_of_an_image_for_sfm_is_mapped_to_the_hr_view(
     photos: PhotoCollection, sfm_conf: SfmConf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

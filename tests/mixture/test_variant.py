@@ -37,6 +37,8 @@ def test_a_variant_is_built_once_and_loaded_as_it_was_built(
     loaded = variant.build(scene, conf, shared_store / "variants", shared_store / "scenes")
     assert (stereo_variant.folder / "variant.json").stat().st_mtime_ns == written
     assert (loaded.id, loaded.folder) == (stereo_variant.id, stereo_variant.folder)
+    assert loaded.id.startswith(f"{variant.key(stereo_scene, conf)}-")
+    assert variant.find(loaded.folder.parent, "0" * 16) is None
     assert loaded.report == stereo_variant.report
     assert np.array_equal(loaded.points, stereo_variant.points)
     assert np.array_equal(loaded.colors, stereo_variant.colors)
@@ -61,28 +63,6 @@ def made(stereo_variant: Variant, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
     monkeypatch.setattr(mixing, "mix_resolutions", make)
     return log
-
-
-def test_the_key_follows_photographs_and_config(
-    stereo_variant: Variant,
-    stereo_scene: SceneConf,
-    procedural_scene: SceneConf,
-    small_conf: Conf,
-) -> None:
-    conf = small_conf(stereo_scene)
-    key = variant.key(stereo_scene, conf)
-    assert stereo_variant.id.startswith(f"{key}-")
-    found = variant.find(stereo_variant.folder.parent, key)
-    assert found is not None
-    assert found.id == stereo_variant.id
-    keys = {
-        key,
-        variant.key(stereo_scene, replace(conf, seed=1)),
-        variant.key(stereo_scene, replace(conf, sfm=replace(conf.sfm, seed=1))),
-        variant.key(procedural_scene, conf),
-    }
-    assert len(keys) == 4
-    assert variant.find(stereo_variant.folder.parent, "0" * 16) is None
 
 
 def test_a_corrupt_variant_is_built_anew_with_a_warning_and_what_a_kill_left_is_removed(

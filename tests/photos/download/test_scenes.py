@@ -141,9 +141,7 @@ def test_a_folder_in_the_way_is_left_alone(
         (["download", "llff", "fern", "--url=ftp://x"], "ftp://x"),
         (["lpips", "--from", "gone"], "gone"),
         (["inspect"], "scene=NAME"),
-        (["inspect", "gone"], "gone"),
         (["inspect", "scene=nope"], "scene=nope"),
-        (["inspect", "scene=motorcycle", "variant.fctor=3"], "variant.fctor"),
     ],
     ids=str,
 )
