@@ -159,9 +159,7 @@ def test_a_gaussian_far_larger_than_the_image_covers_it(backend: str, size: floa
     ("changes", "message"),
     [
         ({"render_mode": "N"}, "render_mode must be one of RGB, D, ED, RGB"),
-        ({"rasterize_mode": "x"}, "rasterize_mode must be one of classic, antialiased"),
         ({"colors": torch.zeros(7, 3)}, r"colors must be \[N, D\].*N = 80, C = 2, got \[7, 3\]"),
-        ({"sh_degree": 1}, r"colors must be \[N, K, 3\].*at least 4"),
         ({"sh_degree": 4}, "sh_degree must be 0 to 3, or None, got 4"),
         ({"backgrounds": torch.zeros(3)}, r"backgrounds must be \[2, 3\], got \[3\]"),
         ({"means": torch.zeros(1, 80, 3)}, r"means must be \[N, 3\], .* got \[1, 80, 3\]"),
@@ -173,7 +171,6 @@ def test_a_gaussian_far_larger_than_the_image_covers_it(backend: str, size: floa
         ({"viewmats": 2 * torch.eye(4).repeat(2, 1, 1)}, "camera 0: viewmat must be a rotation"),
         ({"backgrounds": torch.full((2, 3), torch.inf)}, "backgrounds has values that are not"),
         ({"far_plane": 1.0, "near_plane": 2.0}, "far_plane must be above near_plane"),
-        ({"eps2d": -0.1}, "eps2d at least 0"),
         ({"Ks": torch.diag(torch.tensor([40.0, 40, 2])).repeat(2, 1, 1)}, "the last row of K"),
         (
             {"viewmats": torch.diag(torch.tensor([1.0, 1, 1, 2])).repeat(2, 1, 1)},

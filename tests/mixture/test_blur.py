@@ -106,26 +106,6 @@ def test_without_both_classes_or_enough_pixels_nothing_is_said(
     assert blur_notes(None) == []
 
 
-def test_what_a_mask_hides_does_not_count(
-    views_of: Callable[..., list[View]], save: Save, tmp_path: Path
-) -> None:
-    """A hidden half of noise, which a photograph keeps, is not taken for the scene's detail."""
-    high, low = [texture(seed) for seed in range(4)], [texture(seed) for seed in range(4, 8)]
-    *_, first, second, third, fourth = views_of(high, low, "box")
-    plain = estimated([*(save(image, "HR", 1.0) for image in high), first, second, third, fourth])
-    mask = np.ones((320, 400), np.bool_)
-    mask[:, :100] = False
-    images.save_mask(tmp_path / "mask.png", mask)
-    noise = np.random.default_rng(0).uniform(size=(320, 400, 3)).astype(np.float32)
-    masked = [
-        replace(
-            save(np.where(mask[..., None], image, noise), "HR", 1.0), mask=tmp_path / "mask.png"
-        )
-        for image in high
-    ]
-    assert estimated([*masked, first, second, third, fourth]) == pytest.approx(plain, abs=0.15)
-
-
 @pytest.mark.parametrize(
     ("scene", "how", "expected"),
     [("fern", "downsample", None), ("horns", "box", None), ("fern", "phone", 0.85)],

@@ -65,11 +65,6 @@ def test_jpeg_is_what_pillows_encoder_gives(photo: np.ndarray) -> None:
     assert np.array_equal(found, expected)
 
 
-def test_a_degradation_says_whether_views_become_smaller(photo: np.ndarray) -> None:
-    for name, way in DEGRADATIONS.items():
-        assert degraded(name, photo).shape == ((16, 20, 3) if way.smaller else (80, 100, 3))
-
-
 def test_box_is_the_mean_of_a_pixels_area(photo: np.ndarray) -> None:
     expected = ndimage.uniform_filter(photo.astype(np.float64), (5, 5, 0))[2::5, 2::5]
     assert np.abs(degraded("box", photo) - expected).max() < 1e-7

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.photos.made_files import DISPLAY_P3, profile
 from xrgs.composing import compose
 from xrgs.errors import UnreadableError, XrgsError
 from xrgs.mixture.photographs import (
@@ -195,20 +194,6 @@ def test_a_depth_map_is_left_out_beside_photographs(
     assert note.startswith(f"left out: depth.{suffix} (taken for a depth map: it has one channel")
 
 
-def test_what_was_done_is_said_once_for_each_kind(tmp_path: Path) -> None:
-    files = [write_photograph(tmp_path / f"{name}.png", orientation=6) for name in "ab"]
-    for name in "cd":
-        files.append(tmp_path / f"{name}.png")
-        icc = profile("A phone's", 2.2, DISPLAY_P3)
-        Image.new("RGB", (60, 40), "red").save(files[-1], icc_profile=icc)
-    photos = prepare_hr_views(scene_of(*files), CONF, tmp_path)
-    assert photos.notes == (
-        "converted from A phone's to sRGB: c.png, d.png",
-        "turned upright by EXIF: a.png, b.png",
-    )
-    assert [photo.orientation for photo in photos.all] == [6, 6, 1, 1]
-
-
 def write_cutout(file: Path, hidden: int) -> Path:
     """White, with a quarter of alpha 0 on the left and one of 0.6 on the right."""
     pixels = np.full((40, 60, 4), 255, np.uint8)
@@ -232,12 +217,3 @@ def test_transparent_pixels_get_the_background_alone(tmp_path: Path, alpha: str)
     (note,) = photos.notes
     assert note.endswith(": 20.png, 230.png")
     assert ("[0.2, 0.2, 0.2]" if alpha == "composite" else "scene.alpha=mask") in note
-
-
-def test_an_hr_view_that_no_variant_may_have_names_the_key(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(images, "MAX_PNG_PIXELS", 60 * 40 - 1)
-    files = [write_photograph(tmp_path / f"{name}.png") for name in "ab"]
-    with pytest.raises(XrgsError, match=r"a\.png: an HR view of 60x40 px .*variant\.long_side=0"):
-        prepare_hr_views(Scene("x", "", {file.stem: file for file in files}), CONF, tmp_path)

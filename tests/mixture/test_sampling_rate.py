@@ -26,15 +26,6 @@ def column(*depths: float) -> np.ndarray:
     return np.array([[0, 0, depth] for depth in depths], dtype=np.float64)
 
 
-def test_the_depth_is_the_median_of_the_observed_points() -> None:
-    points = column(1, 2, 3, 4, 5, 6, 7, 8, 9, 100, 100, 100)
-    own = np.arange(9)
-    assert sampling_rate.median_depth(points, np.eye(4), LENS, own) == 5
-    moved = np.eye(4)
-    moved[2, 3] = 10
-    assert sampling_rate.median_depth(points, moved, LENS, own) == 15
-
-
 @pytest.mark.parametrize(("count", "depth"), [(8, 4), (7, 30)])
 def test_eight_observed_points_are_enough_and_seven_are_not(count: int, depth: float) -> None:
     """Eight points at depth 4 are observed, among many at depth 30 inside the image."""

@@ -207,11 +207,6 @@ def test_premultiplied_colours_of_a_tiff_are_divided(tmp_path: Path) -> None:
     assert np.abs(images.read(tmp_path / "a.tif")[:, 40:] * 255 - 40).max() <= 0.6
 
 
-def test_alpha_that_hides_nothing_is_none(tmp_path: Path) -> None:
-    Image.new("RGBA", (60, 40), (9, 9, 9, 255)).save(tmp_path / "a.png")
-    assert images.decode(tmp_path / "a.png").alpha is None
-
-
 @pytest.mark.parametrize("suffix", ["tif", "png", "mpo"])
 def test_of_several_images_the_first_is_read_and_said(tmp_path: Path, suffix: str) -> None:
     """But for a JPEG's: phones add gain maps and depth."""

@@ -218,21 +218,6 @@ def test_a_lease_that_was_taken_over_is_lost_and_its_successor_s_is_not_touched(
     assert not names(folder)
 
 
-def test_a_lost_lease_leaves_its_successor_s_file_alone(folder: Path) -> None:
-    """After a take-over and a release the first generation is free again, for a third owner."""
-    lost = lease.acquire(folder, "cell")
-    assert lost is not None
-    lost.path.unlink()
-    third = lease.acquire(folder, "cell")
-    assert third is not None
-    assert third.path == lost.path
-    elsewhere(third.path, 0)
-    signature = third.path.read_text()
-    assert not lost.beat()
-    lost.release()
-    assert third.path.read_text() == signature
-
-
 def test_a_heartbeat_notices_a_newer_generation(folder: Path) -> None:
     """A successor creates its own file first, and deletes the lost one only then."""
     lost = lease.acquire(folder, "cell")

@@ -43,11 +43,6 @@ def test_the_cores_are_at_most_the_quota_rounded_up(monkeypatch: pytest.MonkeyPa
 GROUPS = {
     "a container of version 2": ("0::/", {"cpu.max": "150000 100000"}, 1.5),
     "no quota": ("0::/", {"cpu.max": "max 100000"}, math.inf),
-    "a quota above": (
-        "0::/user/job/step",
-        {"user/cpu.max": "200000 100000", "user/job/cpu.max": "max 100000"},
-        2.0,
-    ),
     "the least of several": (
         "0::/user/job",
         {"user/cpu.max": "400000 100000", "user/job/cpu.max": "50000 100000"},
@@ -58,22 +53,11 @@ GROUPS = {
         {"cpu,cpuacct/cpu.cfs_quota_us": "300000", "cpu,cpuacct/cpu.cfs_period_us": "100000"},
         3.0,
     ),
-    "a group of version 1": (
-        "1:cpu:/a/b:c",
-        {"cpu/a/b:c/cpu.cfs_quota_us": "25000", "cpu/a/b:c/cpu.cfs_period_us": "50000"},
-        0.5,
-    ),
     "version 1 without a quota": (
         "1:cpu:/",
         {"cpu/cpu.cfs_quota_us": "-1", "cpu/cpu.cfs_period_us": "100000"},
         math.inf,
     ),
-    "both versions": (
-        "1:cpu:/x\n0::/y",
-        {"cpu/x/cpu.cfs_quota_us": "100000", "cpu/x/cpu.cfs_period_us": "100000"},
-        1.0,
-    ),
-    "another controller": ("1:cpuset:/", {"cpuset/cpu.max": "100000 100000"}, math.inf),
     "a group outside of the container": ("0::/../other", {"cpu.max": "100000 100000"}, 1.0),
     "not Linux": (None, {}, math.inf),
 }

@@ -62,13 +62,6 @@ def test_only_regular_files_are_read(root: Path, kind: str) -> None:
     assert not is_transient(raised.value)
 
 
-def test_a_walk_has_each_file_and_ends_at_links(root: Path) -> None:
-    (root / "a" / "up").symlink_to(root)
-    found = {name: status.st_size for name, status in files.walk_files(root / "a")}
-    assert found.keys() == {"b/file", "up"}
-    assert found["b/file"] == files.file_bytes(root / "a") == 3
-
-
 def test_whatever_is_there_is_removed_and_no_target_of_a_link(root: Path) -> None:
     for name in ("a/link", "link"):
         (root / name).symlink_to(root / "outside")

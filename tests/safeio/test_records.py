@@ -18,7 +18,6 @@ from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.safeio.records import (
     as_number,
     errors_named,
-    list_folder,
     read_struct,
     read_table,
     table_text,
@@ -117,17 +116,6 @@ def test_a_table_has_at_most_20000_rows_and_1000_columns(file: Path) -> None:
     file.write_text(",".join(map(str, range(1001))))
     with pytest.raises(StoreError, match="1000 columns"):
         read_table(file)
-
-
-def test_a_folder_is_listed_or_named(tmp_path: Path) -> None:
-    (tmp_path / "b").mkdir()
-    (tmp_path / "a").touch()
-    assert list_folder(tmp_path) == ["a", "b"]
-    assert list_folder(tmp_path / "none") == []
-    for name in ("a", "a/inside"):
-        with pytest.raises(StoreError, match=name) as refused:
-            list_folder(tmp_path / name)
-        assert not isinstance(refused.value, UnreadableError)
 
 
 @pytest.mark.parametrize(

@@ -478,14 +478,11 @@ def write_degraded(
         if kind == "sfm_lr":  # HR views already have such a size
             size = _divisible(*photos.size("sfm", i), conf.factor)
             high, mask = images.resize(high, *size), masks.resized(mask, *size)
-        low = degrade(high, conf, _random(photos.names[i], conf))
+        # The random numbers of a view do not depend on the other views.
+        random = np.random.default_rng(int(digest([conf.seed, photos.names[i]]), 16))
+        low = degrade(high, conf, random)
         images.save(photos.folder / photos.file(kind, i), low, durable=False)
         photos.save_mask(kind, i, masks.degraded(mask, low.shape[:2], conf.factor))
-
-
-def _random(name: str, conf: VariantConf) -> np.random.Generator:
-    """Return the random generator of a view, which does not depend on the other views."""
-    return np.random.default_rng(int(digest([conf.seed, name]), 16))
 
 
 def _divisible(width: int, height: int, factor: int) -> tuple[int, int]:

@@ -190,7 +190,8 @@ def sign(path: Path) -> Owner:
 
     FileExistsError if it exists.
     """
-    owner = _self()
+    pid = os.getpid()  # not cached: a process may be forked
+    owner = Owner(socket.gethostname(), processes.boot(), pid, processes.started(pid))
     with path.open("xb") as stream:
         try:
             stream.write(json.dumps(msgspec.structs.asdict(owner)).encode())
@@ -261,9 +262,3 @@ def _now(folder: Path) -> float:
     except OSError:
         return time.time()
     return now
-
-
-def _self() -> Owner:
-    """Return this process as an owner. It is not cached, because a process may be forked."""
-    pid = os.getpid()
-    return Owner(socket.gethostname(), processes.boot(), pid, processes.started(pid))

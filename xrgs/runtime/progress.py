@@ -147,7 +147,8 @@ class ProgressBar(_Tqdm):
             if self._file is None:
                 log_line(str(state))
             else:
-                _write(self._file.path, state)
+                with suppress(OSError):  # nothing is lost: progress is not a result
+                    write_json(self._file.path, msgspec.structs.asdict(state), durable=False)
         return None
 
     def _rate(self) -> float | None:
@@ -163,12 +164,6 @@ def progress(
 ) -> Iterator[_T]:
     """Iterate over items while a `ProgressBar`, which has the same arguments, counts them."""
     return iter(ProgressBar(what, unit, total, items=items, done=done))
-
-
-def _write(file: Path, state: Progress) -> None:
-    # Progress is not a result: nothing is lost when it can't be written.
-    with suppress(OSError):
-        write_json(file, msgspec.structs.asdict(state), durable=False)
 
 
 @contextmanager

@@ -103,14 +103,7 @@ def guard_streams() -> None:
         # A stream that other code has put in the place of Python's own stays.
         if stream is getattr(sys, f"__{name}__"):
             encoding = "utf-8" if stream is None else stream.encoding
-            setattr(sys, name, _without_write_errors(descriptor, encoding))
-
-
-def _without_write_errors(descriptor: int, encoding: str) -> TextIO:
-    raw = _WriteErrorsIgnored(descriptor, "w", closefd=False)
-    return io.TextIOWrapper(
-        io.BufferedWriter(raw),
-        encoding=encoding,
-        errors="backslashreplace",  # help and bars have characters that ASCII lacks
-        line_buffering=True,
-    )
+            raw = io.BufferedWriter(_WriteErrorsIgnored(descriptor, "w", closefd=False))
+            # Help and bars have characters that ASCII lacks.
+            text = io.TextIOWrapper(raw, encoding, "backslashreplace", line_buffering=True)
+            setattr(sys, name, text)

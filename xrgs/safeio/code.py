@@ -62,7 +62,8 @@ class CodeFolders:
     def core(self) -> tuple[str, ...]:
         """Return the files that count always, sorted."""
         outside = (*self.whole_parts, *self.folders_of_parts)
-        files = {name for name in _names(*self.folders) if not _is_in(name, outside)}
+        names = {file.relative_to(PACKAGE).as_posix() for file in sources(*self.folders)}
+        files = {name for name in names if not _is_in(name, outside)}
         files |= {f"{folder}/__init__.py" for folder in self.folders_of_parts}
         return tuple(sorted(self._with_imports(files, self.parts) - self.registries))
 
@@ -88,10 +89,6 @@ class CodeFolders:
             pending += imported - files - {*end}
             files |= imported - {*end}
         return files
-
-
-def _names(*names: str) -> set[str]:
-    return {file.relative_to(PACKAGE).as_posix() for file in sources(*names)}
 
 
 def _is_in(name: str, folders: Iterable[str]) -> bool:

@@ -263,18 +263,3 @@ def test_colours_of_any_type_are_read(
     points, colors = colmap.read_points(file)
     assert points == pytest.approx(POINTS)
     assert (colors == COLORS).all()
-
-
-def test_points_without_colours_are_grey_with_a_word(tmp_path: Path) -> None:
-    file = write_transforms(tmp_path / "a")
-    write_points(tmp_path / "a" / "points.ply", "u1", (), np.zeros((len(POINTS), 0)))
-    given = transforms.read([file])
-    assert (given.colors == 128).all()
-    assert given.notes == ["points.ply has no colours: the splats begin grey"]
-
-
-def test_a_ply_that_has_no_points_is_named(tmp_path: Path) -> None:
-    rows = np.zeros(3, [("x", "f4"), ("z", "f4")])
-    PlyData([PlyElement.describe(rows, "vertex")]).write(tmp_path / "a.ply")
-    with pytest.raises(XrgsError, match=r"a\.ply: its vertices have no property y"):
-        colmap.read_points(tmp_path / "a.ply")

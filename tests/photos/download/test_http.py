@@ -118,16 +118,6 @@ def test_a_server_that_brings_nothing_new_is_given_up(server: Any, target: Path)
     assert len(server.asked) <= 1 + http._TRIES
 
 
-def test_a_slow_server_is_given_up(
-    server: Any, target: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(http, "_PERIOD_S", 0.3)
-    monkeypatch.setattr(http, "_TRIES", 1)
-    server.content, server.drips = CONTENT, True
-    with pytest.raises(DownloadError, match=r"fewer than 60000 bytes in 0\.3 s"):
-        download(server.url, target, MOST)
-
-
 def test_another_content_is_not_kept(server: Any, target: Path) -> None:
     server.content = CONTENT[:-1] + b"?"
     with pytest.raises(DownloadError, match=f"sha256 is [0-9a-f]{{64}}, expected {SHA256}"):
@@ -181,16 +171,6 @@ def test_a_second_process_does_not_append_to_the_same_file(
         with pytest.raises(DownloadError, match=r"scenes\.zip: another process"):
             download(server.url, target, MOST)
     assert server.asked == []
-
-
-def test_a_part_that_has_become_the_file_meanwhile_is_not_appended_to(
-    server: Any, target: Path, part: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The process that held the lock renames the part after this one has opened it."""
-    monkeypatch.setattr(fcntl, "flock", lambda *_: part.rename(target))
-    with pytest.raises(DownloadError, match="there already"):
-        download(server.url, target, MOST)
-    assert target.read_bytes() == CONTENT[:300_000]
 
 
 def test_five_redirects_are_followed_and_no_more(server: Any, target: Path) -> None:

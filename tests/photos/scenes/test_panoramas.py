@@ -51,13 +51,6 @@ def test_pictures_of_all_directions_are_left_out_without_metadata(tmp_path: Path
     )
 
 
-def test_photographs_that_are_twice_as_wide_as_high_are_kept(tmp_path: Path) -> None:
-    for i in range(8):
-        Image.fromarray(texture(i, (200, 100))).save(tmp_path / f"a{i}.jpg")
-    found = folder.look(str(tmp_path), 0)
-    assert (len(found.files), found.notes) == (8, ())
-
-
 def changed(kind: str, seed: int) -> NDArray[np.uint8]:
     """A panorama of all directions, as its maker left it."""
     picture = sphere(seed)

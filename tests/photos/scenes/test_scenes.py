@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -88,14 +85,6 @@ def test_a_label_is_one_printable_line(tmp_path: Path) -> None:
     assert len(scenes.label(replace(PROCEDURAL, name="x" * 9_999))) == 200
 
 
-def test_two_processes_that_render_at_once_get_one_complete_scene(tmp_path: Path) -> None:
-    with ThreadPoolExecutor(2) as pool:
-        found = list(pool.map(lambda _: scenes.resolve(PROCEDURAL, tmp_path, 60), range(2)))
-    assert found[0].files == found[1].files
-    assert all(images.read(file).shape == (45, 60, 3) for file in found[0].files.values())
-    assert [p.name for p in tmp_path.iterdir() if p.name[0] != "."] == [found[0].fingerprint]
-
-
 def test_size_and_number_of_views_are_in_the_fingerprint() -> None:
     marks = {
         scenes.fingerprint(PROCEDURAL, 60),
@@ -118,19 +107,6 @@ def test_what_becomes_of_alpha_is_in_the_fingerprint() -> None:
         scenes.fingerprint(replace(PROCEDURAL, alpha="none"))
     with pytest.raises(XrgsError, match=r"scene\.background=\[0, 0, 255\]: values must be 0 to 1"):
         scenes.fingerprint(replace(PROCEDURAL, background=(0, 0, 255)))
-
-
-def test_fingerprints_need_neither_torch_nor_scikit_image() -> None:
-    script = (
-        "import sys; from xrgs.photos import scenes; from xrgs.composing import compose;"
-        "scenes.fingerprint(compose('scene=procedural').scene, 100);"
-        "scenes.fingerprint(compose('scene=motorcycle').scene);"
-        "print(sorted({'torch', 'skimage', 'pycolmap'} & set(sys.modules)))"
-    )
-    done = subprocess.run(
-        [sys.executable, "-P", "-c", script], capture_output=True, text=True, check=True
-    )
-    assert done.stdout.strip() == "[]"
 
 
 def test_folders_called_images_have_the_name_of_the_folder_around_them(tmp_path: Path) -> None:

@@ -173,7 +173,7 @@ class _Found:
 
 def _inside(folder: Path, long_side: int, masks: Path | None) -> _Found:
     """List the photographs in a folder itself, or one of the sizes of an LLFF scene."""
-    inside = filter(_is_size, sorted(folder.iterdir()))
+    inside = [one for one in sorted(folder.iterdir()) if SIZES.fullmatch(one.name) and one.is_dir()]
     sizes = {one: files for one in inside if (files := _images_in(one))}
     taken, notes = one_of_each_size([*sizes.values()], long_side)
     by_name = {files[0].parent.name: list(files) for files in taken}
@@ -412,10 +412,6 @@ def _check_heic(files: Sequence[Path]) -> None:
             f"{heic[0]}: {len(heic)} of {len(files)} photographs are HEIC, which needs "
             "pillow-heif: pip install 'xrgs[heic]'"
         )
-
-
-def _is_size(folder: Path) -> bool:
-    return SIZES.fullmatch(folder.name) is not None and folder.is_dir()
 
 
 def _images_in(folder: Path) -> list[Path]:
