@@ -153,22 +153,6 @@ def test_named_axes_are_turned_as_niantics_library_turns(
     torch.testing.assert_close(covariances(read), covariances(other), atol=1e-6, rtol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("extension", "message"),
-    [
-        (struct.pack("<III", 0xADBE0003, 4, 17), "names axes 17, not 0 to 16"),
-        (struct.pack("<III", 0xADBE0003, 400, 6), "ends within an extension"),
-    ],
-)
-def test_damaged_extensions_are_named(file: Path, extension: bytes, message: str) -> None:
-    write_spz(file, scene(3))
-    content = unpacked(file)
-    content[14] |= 2
-    file.write_bytes(gzip.compress(bytes(content) + extension))
-    with pytest.raises(XrgsError, match=message):
-        read_spz(file)
-
-
 def unpacked(file: Path) -> bytearray:
     return bytearray(gzip.decompress(file.read_bytes()))
 

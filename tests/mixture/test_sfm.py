@@ -67,24 +67,19 @@ def test_the_stereo_pair_is_registered_with_its_known_intrinsics(stereo_pair: St
         assert model.lenses[i].is_pinhole
 
 
-@pytest.mark.parametrize(("focal", "expected"), [(497.5, 497.5), (None, 1.2 * 370)])
-def test_two_views_keep_the_focal_length_that_exif_gives(
-    sfm_conf: SfmConf,
-    stereo_scene: SceneConf,
-    tmp_path: Path,
-    focal: float | None,
-    expected: float,
+def test_two_views_keep_the_focal_length_that_they_begin_with(
+    sfm_conf: SfmConf, stereo_scene: SceneConf, tmp_path: Path
 ) -> None:
     """From two views it can't be told apart from the depth. They are half the pair's size."""
     scene = scenes.resolve(stereo_scene, tmp_path)
     inputs = []
     for file in scene.files.values():
         images.save(tmp_path / file.name, images.resize(images.read(file), 370, 250))
-        inputs.append(sfm.SfmImage(file.name, file.stem, "all", None, focal))
+        inputs.append(sfm.SfmImage(file.name, file.stem, "all"))
     model = sfm.reconstruct(inputs, tmp_path, tmp_path, sfm_conf)
-    assert [lens.params[0] for lens in model.lenses.values()] == pytest.approx([expected] * 2)
-    guessed = any("focal length is a guess" in note for note in model.report["notes"])
-    assert guessed == (focal is None)
+    focals = [lens.params[0] for lens in model.lenses.values()]
+    assert focals == pytest.approx([1.2 * 370] * 2)
+    assert any("focal length is a guess" in note for note in model.report["notes"])
 
 
 def test_its_points_lie_at_the_depths_of_the_published_disparity(stereo_pair: StereoPair) -> None:

@@ -105,19 +105,6 @@ def test_a_table_is_read_back_exactly(rows: list[list[str]]) -> None:
     assert [[row[0], row[2]] for row in found[1:]] == rows
 
 
-def test_a_table_has_at_most_20000_rows_and_1000_columns(file: Path) -> None:
-    file.write_text("a\n" + "1\n" * 20_000)
-    assert len(read_table(file)[1]) == 20_000
-    file.write_text("a\n" + "1\n" * 20_001)
-    with pytest.raises(StoreError, match="more than 20000 rows"):
-        read_table(file)
-    file.write_text(",".join(map(str, range(1000))))
-    assert len(read_table(file)[0]) == 1000
-    file.write_text(",".join(map(str, range(1001))))
-    with pytest.raises(StoreError, match="1000 columns"):
-        read_table(file)
-
-
 @pytest.mark.parametrize(
     ("number", "passes"),
     [(errno.EACCES, True), (errno.EIO, True), (errno.ESTALE, True), (errno.ENOENT, False)],
