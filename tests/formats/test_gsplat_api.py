@@ -363,3 +363,14 @@ def test_gsplats_default_strategy_runs_on_it() -> None:
     assert losses[4] < 0.95 * losses[0]  # before the strategy changes any Gaussian
     assert counts[:4] == [60] * 4
     assert len({*counts}) >= 3, "Gaussians are grown and pruned at steps 4 and 8"
+
+
+def test_black_gaussians_have_gradients() -> None:
+    """At the value where the rasterizer clamps."""
+    made = scene()
+    ours = tracked(made._replace(colors=torch.zeros_like(made.colors)))
+    colors, _, meta = rasterization(**ours.arguments(), packed=False)
+    torch.autograd.backward(colors.sum())
+    drawn = (meta["radii"] > 0).all(-1).any(0)
+    assert ours.colors.grad is not None
+    assert (ours.colors.grad[drawn] > 0).any(-1).sum() > 10

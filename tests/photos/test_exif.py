@@ -101,3 +101,11 @@ def test_a_panorama_is_named_by_its_projection(tmp_path: Path, suffix: str) -> N
     assert exif.read(file).projection == name
     inside = f"><GPano:ProjectionType>{name}</GPano:ProjectionType></rdf:Description>"
     assert exif.read(write(file, xmp=inside)).projection == name
+
+
+def test_phones_name_their_panoramas_and_ordinary_photographs(tmp_path: Path) -> None:
+    assert exif.read(write(tmp_path / "a.jpg", {0xA401: 6}, make="Apple")).projection
+    assert not exif.read(write(tmp_path / "a.jpg", {0xA401: 2}, make="Apple")).projection
+    assert not exif.read(write(tmp_path / "a.jpg", {0xA401: 6})).projection
+    flat = write(tmp_path / "a.jpg", xmp='GPano:ProjectionType="perspective"/>')
+    assert not exif.read(flat).projection

@@ -22,6 +22,7 @@ from tests.photos.made_files import (
     png,
     with_entry,
 )
+from xrgs.photos import exif as exif_of
 from xrgs.photos import images
 from xrgs.photos.images import ImageError
 
@@ -239,3 +240,10 @@ def test_heic_without_its_package_says_what_to_install(
     (tmp_path / "a.heic").write_bytes(b"\0\0\0\x18ftypheic" + bytes(100))
     with pytest.raises(ImageError, match=r"a\.heic: .*pip install 'xrgs\[heic\]'"):
         images.size(tmp_path / "a.heic")
+
+
+def test_heic_is_read_with_its_camera(tmp_path: Path) -> None:
+    tags = Image.Exif()
+    tags[0x010F] = "Maker"
+    Image.new("RGB", (60, 40)).save(tmp_path / "a.heic", exif=tags.tobytes())
+    assert exif_of.read(tmp_path / "a.heic").camera == "Maker"

@@ -197,3 +197,14 @@ def test_a_lens_that_folds_at_every_zoom_is_refused() -> None:
         XrgsError, match="SIMPLE_RADIAL: it can't be undistorted, because its distortion folds"
     ):
         simple(-500.0).undistorted()
+
+
+def test_a_strong_barrel_lens_does_not_fold_the_picture() -> None:
+    """r + k r³ falls beyond r² = 1/(3 · 0.9): no pixel may come from there."""
+    lens = lens_of_model("SIMPLE_RADIAL", (W, H), [60.0, 50.0, 40.0, -0.9])
+    f = lens.undistorted().K[0, 0]
+    corner = np.array([-50.0, -40.0]) / f
+    assert (corner**2).sum() < 1 / (3 * 0.9)
+    source = corner * (1 - 0.9 * (corner**2).sum()) * 60 + (50, 40)
+    assert (source >= 0).all()
+    assert (source <= (W, H)).all()

@@ -16,8 +16,8 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 from PIL import Image
 
-from tests.photos.made_files import SHORT, png
-from xrgs.photos import images
+from tests.photos.made_files import SHORT, png, with_entry
+from xrgs.photos import exif, images
 from xrgs.photos.images import ImageError
 
 #: An image whose first value is white, so that its depth is plain.
@@ -247,3 +247,23 @@ def test_a_tiff_without_some_of_its_strips_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.tif").write_bytes(content[:place] + bytes(4) + content[place + 4 :])
     with pytest.raises(ImageError, match=r"a\.tif: unreadable or truncated image"):
         images.decode(tmp_path / "a.tif")
+
+
+def test_white_is_zero(tmp_path: Path) -> None:
+    samples = np.random.default_rng(0).integers(0, 65536, (40, 60, 1)).astype(np.uint16)
+    tifffile.imwrite(tmp_path / "a.tif", 65535 - samples[..., 0], photometric="miniswhite")
+    check(tmp_path / "a.tif", samples)
+
+
+def test_the_camera_of_a_tiff_of_16_bits_is_read(tmp_path: Path) -> None:
+    samples = np.full((9, 9, 3), 40_000, np.uint16)
+    tifffile.imwrite(
+        tmp_path / "a.tif",
+        samples,
+        photometric="rgb",
+        extratags=[(0x010F, 2, 0, "Maker", True), (0x0110, 2, 0, "X 100", True)],
+    )
+    assert exif.read(tmp_path / "a.tif").camera == "Maker/X 100"
+    with_tag = with_entry((tmp_path / "a.tif").read_bytes(), SHORT, 1, b"\6\0")
+    (tmp_path / "a.tif").write_bytes(with_tag)
+    assert images.header(tmp_path / "a.tif").orientation == 6

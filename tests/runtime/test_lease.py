@@ -306,3 +306,28 @@ def test_a_lease_that_is_created_again_meanwhile_is_not_taken_for_the_dead_one(
     assert held is not None
     assert held.path.name == "cell.0"
     assert contender.exists()
+
+
+def test_a_process_id_that_is_reused_is_another_process(folder: Path) -> None:
+    held = lease.acquire(folder, "cell")
+    assert held is not None
+    file = held.path
+    owner = json.loads(file.read_text())
+    file.write_text(json.dumps(owner | {"started": owner["started"] - 10}))
+    assert not lease.holders(folder)
+    assert lease.acquire(folder, "cell") is not None
+
+
+def test_a_lost_lease_leaves_its_successor_s_file_alone(folder: Path) -> None:
+    """After a take-over and a release the first generation is free again, for a third owner."""
+    lost = lease.acquire(folder, "cell")
+    assert lost is not None
+    lost.path.unlink()
+    third = lease.acquire(folder, "cell")
+    assert third is not None
+    assert third.path == lost.path
+    elsewhere(third.path, 0)
+    signature = third.path.read_text()
+    assert not lost.beat()
+    lost.release()
+    assert third.path.read_text() == signature

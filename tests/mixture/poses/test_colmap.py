@@ -252,3 +252,15 @@ def test_binary_files_are_preferred_and_a_model_may_have_no_points(tmp_path: Pat
     assert len(colmap.read(folder).points) == 0
     (folder / "images.bin").unlink()
     assert colmap.files(folder) == []
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-3])
+def test_quaternions_of_few_digits_or_another_length_are_rotations(
+    tmp_path: Path, scale: float
+) -> None:
+    quat = pycolmap.Rotation3d(viewmat(1)[:3, :3]).quat * scale
+    digits = {1 + i: f"{quat[(i + 3) % 4]:.4g}" for i in range(4)}
+    folder = edited(tmp_path / "a", "images.txt", words(2, digits))
+    matrix = colmap.read(folder).camera(NAMES[1], STORED)[1]
+    assert np.abs(matrix - viewmat(1)).max() < 3e-4
+    assert matrix[:3, :3] @ matrix[:3, :3].T == pytest.approx(np.eye(3), abs=1e-12)

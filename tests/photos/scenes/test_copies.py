@@ -281,3 +281,39 @@ def test_links_to_folders_elsewhere_are_named(tmp_path: Path) -> None:
     assert below(tmp_path / "here").notes == (
         "images left out: 6 in more (links to folders are not followed)",
     )
+
+
+def test_copies_of_the_sizes_that_are_not_taken_are_left_out(tmp_path: Path) -> None:
+    shoot(tmp_path / "images")
+    shoot(tmp_path / "images_2", size=(80, 60))
+    for number in range(6):
+        backup = tmp_path / "backup" / f"photo {number}.jpg"
+        backup.parent.mkdir(exist_ok=True)
+        shutil.copy(tmp_path / "images" / f"IMG_{number}.jpg", backup)
+    found = below(tmp_path, 80)
+    assert {file.parent.name for file in found.files.values()} == {"images_2"}
+    assert "backup/photo 0.jpg (of images/IMG_0.jpg)" in found.notes[1]
+
+
+def test_photographs_with_films_behind_them_are_whole(tmp_path: Path) -> None:
+    for file in shoot(tmp_path / "images").iterdir():
+        file.write_bytes(file.read_bytes() + bytes(5000))
+    shoot(tmp_path / "images_2", size=(80, 60))
+    assert folder.look(str(tmp_path), 0).files["IMG_0"].parent.name == "images"
+
+
+def test_dark_photographs_of_one_name_stay(tmp_path: Path) -> None:
+    for day in range(2):
+        for number in range(3):
+            file = tmp_path / f"night{day}" / f"{number}.png"
+            file.parent.mkdir(exist_ok=True)
+            dark = ImageEnhance.Brightness(picture(10 * day + number)).enhance(0.02)
+            dark.resize((160 - 40 * day, 120 - 30 * day)).save(file)
+    assert len(below(tmp_path).files) == 6
+
+
+def test_grey_photographs_stay(tmp_path: Path) -> None:
+    for number in range(4):
+        write(tmp_path / f"{number}.png", number)
+        picture(number).convert("L").save(tmp_path / f"{number}.png")
+    assert len(folder.look(str(tmp_path), 0).files) == 4

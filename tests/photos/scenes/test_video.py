@@ -313,3 +313,30 @@ def test_a_video_of_all_directions_is_refused(tmp_path: Path) -> None:
     write_streams(tmp_path / "a.mkv", sphere(1, 64))
     with pytest.raises(ImageError, match=r"a\.mkv: its frames show all directions, 360 degrees"):
         scenes.resolve(conf(tmp_path / "a.mkv", 2), tmp_path)
+
+
+def test_the_colours_of_large_videos_that_name_none_are_those_that_players_take(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """BT.709's from 720 rows on, as in Chromium, and BT.601's below."""
+    middles = []
+    for height in (718, 720):
+        monkeypatch.setattr(f"{__name__}.HEIGHT", height)
+        write_video(
+            tmp_path / f"{height}.mkv",
+            [patches(TO_SRGB, BT709 if height >= 720 else BT601)] * 2,
+            "ffv1",
+            ("yuv420p", "yuv420p"),
+        )
+        scene = scenes.resolve(conf(tmp_path / f"{height}.mkv", 2), tmp_path / str(height))
+        middles.append(images.read(scene.files["frame_0000"])[height // 2, 8::16] * 255)
+    assert np.abs(np.array(middles) - PATCHES).max() <= 4
+
+
+def test_the_aspect_may_be_in_the_stream_alone(tmp_path: Path) -> None:
+    write_video(tmp_path / "a.mp4", [disc(24, Fraction(2))] * 2, aspect=Fraction(2))
+    content = (tmp_path / "a.mp4").read_bytes()
+    assert content.count(b"pasp") == 1
+    (tmp_path / "a.mp4").write_bytes(content.replace(b"pasp", b"free"))
+    scene = scenes.resolve(conf(tmp_path / "a.mp4", 2), tmp_path)
+    assert images.size(scene.files["frame_0000"]) == (2 * WIDTH, HEIGHT)
