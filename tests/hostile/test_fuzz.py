@@ -66,7 +66,7 @@ MAX_CPU_S = 2.0
 #: Address space, in bytes, beyond what the process has; a file that needs more gets a MemoryError.
 _ADDRESS_SPACE = 1 << 30
 #: The most cuts of a file that are tried: at every byte of a small one, evenly spaced in others.
-_MAX_CUTS = 40
+_MAX_CUTS = 25
 
 
 @dataclass(frozen=True)

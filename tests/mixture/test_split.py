@@ -214,3 +214,13 @@ def test_a_name_that_needs_quotes_is_answered_with_the_word_to_type(
     with pytest.raises(XrgsError) as caught:
         check_test_names(names, configured(test=given))
     assert f" On a command line it is {word}, in a file of YAML test: [" in str(caught.value)
+
+
+def test_a_uniform_selection_is_evenly_spaced(configured: Make) -> None:
+    conf = configured(selection="uniform", test_every=0, hr_fraction=0.25, min_hr=0)
+    assert split_views(names(16), conf).hr == (2, 6, 10, 14)
+
+
+def test_a_factor_too_large_for_the_ssim_window_is_named(configured: Make) -> None:
+    with pytest.raises(XrgsError, match=r"variant\.factor=40: LR views of 12x9 px .*SSIM window"):
+        hr_geometry((504, 378), 1.0, configured(factor=40))

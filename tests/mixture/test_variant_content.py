@@ -109,14 +109,14 @@ def test_one_pose_at_two_sizes_shows_one_image(stereo_variant: Variant) -> None:
 def test_photographs_of_fern_are_registered_at_a_reduced_size(
     build: Build, data_root: Path, tmp_path: Path
 ) -> None:
-    files = sorted((data_root / "llff" / "fern" / "images_4").glob("*"))[:8]
+    files = sorted((data_root / "llff" / "fern" / "images_4").glob("*"))[:6]
     if not files:
         pytest.skip("fern is not there")
     for file in files:
         images.save(tmp_path / "fern" / f"{file.stem}.png", images.read(file))
     few = {"max_num_features": 1500, "long_side": 504}
     built = build(scene_conf("folder", tmp_path / "fern", name="fern"), sfm=few)
-    assert built.report["registered"] == 8
+    assert built.report["registered"] == 6
     assert len(select(built, "test", "HR")) == 1
     assert {(v.width, v.height) for v in select(built, "train", "LR")} == {(50, 37)}
     assert len(built.points) > 100
