@@ -64,84 +64,58 @@ def test_gradients_of_cameras_are_refused() -> None:
             rasterization(**wrong)
 
 
-def test_gsplats_global_shutter_is_its_default() -> None:
-    shutter = inspect.signature(gsplat.rasterization).parameters["rolling_shutter"].default
-    rasterization(**arguments(rolling_shutter=shutter))
-
-
 TENSORS = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "backgrounds")
 
 
 @pytest.mark.parametrize("name", TENSORS)
-@pytest.mark.parametrize(
-    ("convert", "got"),
-    [(lambda tensor: tensor.numpy(), "ndarray"), (lambda tensor: tensor.tolist(), "list")],
-)
-def test_what_is_no_tensor_is_named(name: str, convert: Any, got: str) -> None:
-    wrong = arguments(**{name: convert(arguments()[name])})
-    with pytest.raises(TypeError, match=f"^{name} must be a torch.Tensor, got {got}$"):
-        rasterization(**wrong)
+def test_a_tensor_of_a_wrong_type_is_named(name: str) -> None:
+    given = arguments()[name]
+    for wrong, message in (
+        (given.numpy(), f"^{name} must be a torch.Tensor, got ndarray$"),
+        (given.half(), f"^{name} must be float32 or float64, got torch.float16"),
+        (given.long(), f"^{name} must be float32 or float64, got torch.int64"),
+    ):
+        with pytest.raises((TypeError, ValueError), match=message):
+            rasterization(**arguments(**{name: wrong}))
+    if name in {"quats", "scales", "opacities", "colors", "backgrounds"}:
+        message = f"^{name} must be of the type of means, torch.float32"
+        with pytest.raises(ValueError, match=message):
+            rasterization(**arguments(**{name: given.double()}))
 
 
-@pytest.mark.parametrize("name", [*TENSORS[:7]])
-def test_none_is_named(name: str) -> None:
-    with pytest.raises(TypeError, match=f"^{name} must be a torch.Tensor, got None$"):
-        rasterization(**arguments(**{name: None}))
-
-
-@pytest.mark.parametrize("name", TENSORS)
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.int64, torch.uint8])
-def test_types_that_are_not_served_are_named(name: str, dtype: torch.dtype) -> None:
-    wrong = arguments(**{name: arguments()[name].to(dtype)})
-    with pytest.raises(ValueError, match=f"^{name} must be float32 or float64, got {dtype}"):
-        rasterization(**wrong)
-
-
-@pytest.mark.parametrize("name", ["quats", "scales", "opacities", "colors", "backgrounds"])
-def test_parameters_of_two_types_are_named(name: str) -> None:
-    wrong = arguments(**{name: arguments()[name].double()})
-    with pytest.raises(ValueError, match=f"^{name} must be of the type of means, torch.float32"):
-        rasterization(**wrong)
-
-
-@pytest.mark.parametrize("name", ["width", "height", "sh_degree"])
-@pytest.mark.parametrize("value", [2.0, "2"])
+@pytest.mark.parametrize(("name", "value"), [("width", 2.0), ("height", "2"), ("sh_degree", 2.0)])
 def test_what_is_no_whole_number_is_named(name: str, value: object) -> None:
     with pytest.raises(TypeError, match=f"^{name} must be a whole number, got {value!r}"):
         rasterization(**arguments(**{name: value}))
 
 
-@pytest.mark.parametrize("place", [0, -1])
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
         *((name, torch.nan, f"{name} has values that are not finite") for name in TENSORS[:5]),
-        ("means", -torch.inf, "means has values that are not finite"),
         ("opacities", 1.5, "opacities has values outside 0..1; are these logits"),
         ("opacities", -0.1, "opacities has values outside 0..1"),
         ("scales", -1.0, "scales has values below 0"),
     ],
 )
 def test_one_wrong_value_is_named_even_of_what_is_not_drawn(
-    name: str, value: float, message: str, place: int
+    name: str, value: float, message: str
 ) -> None:
     wrong = arguments()
     wrong["means"][-1, 2] = -5.0  # behind the cameras
-    wrong[name].view(80, -1)[place] = value
+    wrong[name].view(80, -1)[-1] = value
     with pytest.raises(ValueError, match=message):
         rasterization(**wrong)
 
 
-@pytest.mark.parametrize("backend", ["native", "torch"])
-@pytest.mark.parametrize("packed", [True, False])
-@pytest.mark.parametrize("mode", ["RGB", "RGB+ED"])
-def test_no_gaussians_give_the_background(backend: str, packed: bool, mode: Any) -> None:
+@pytest.mark.parametrize(("backend", "packed"), [("native", True), ("torch", False)])
+def test_no_gaussians_give_the_background(backend: str, packed: bool) -> None:
     empty = {name: arguments()[name][:0] for name in TENSORS[:5]}
     background = torch.tensor([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])
     image, alpha, meta = rasterization(
         **arguments(**empty, backgrounds=background),
         packed=packed,
-        render_mode=mode,
+        render_mode="RGB+ED",
         backend=backend,
     )
     assert torch.equal(image[..., :3], background[:, None, None].expand(2, 29, 37, 3))
@@ -150,8 +124,7 @@ def test_no_gaussians_give_the_background(backend: str, packed: bool, mode: Any)
     assert meta["radii"].numel() == 0
 
 
-@pytest.mark.parametrize("backend", ["native", "torch"])
-@pytest.mark.parametrize("sh_degree", [None, 1])
+@pytest.mark.parametrize(("backend", "sh_degree"), [("native", 1), ("torch", None)])
 def test_tensors_that_are_not_contiguous(backend: str, sh_degree: int | None) -> None:
     usual = arguments(sh_degree=sh_degree, backend=backend)
     usual["means"][:, 2] += 2
@@ -167,16 +140,7 @@ def test_tensors_that_are_not_contiguous(backend: str, sh_degree: int | None) ->
         assert torch.equal(got, wanted)
 
 
-def test_float64_is_rendered_in_float64() -> None:
-    usual = arguments()
-    usual["means"][:, 2] += 2
-    double = usual | {name: usual[name].double() for name in TENSORS}
-    image, _, meta = rasterization(**double)
-    assert image.dtype == meta["means2d"].dtype == torch.float64
-    torch.testing.assert_close(image.float(), rasterization(**usual)[0], atol=1e-5, rtol=0)
-
-
-@pytest.mark.parametrize("size", [1e6, 1e8, 1e10, 1e15])
+@pytest.mark.parametrize("size", [1e8, 1e15])
 @pytest.mark.parametrize("backend", ["native", "torch"])
 def test_a_gaussian_far_larger_than_the_image_covers_it(backend: str, size: float) -> None:
     """Its alpha is its opacity everywhere; int32 holds radii of 2e9 px, and float32 overflows."""
@@ -195,32 +159,18 @@ def test_a_gaussian_far_larger_than_the_image_covers_it(backend: str, size: floa
     ("changes", "message"),
     [
         ({"render_mode": "N"}, "render_mode must be one of RGB, D, ED, RGB"),
-        ({"rasterize_mode": "x"}, "rasterize_mode must be one of classic, antialiased"),
         ({"colors": torch.zeros(7, 3)}, r"colors must be \[N, D\].*N = 80, C = 2, got \[7, 3\]"),
-        ({"sh_degree": 1}, r"colors must be \[N, K, 3\].*at least 4"),
         ({"sh_degree": 4}, "sh_degree must be 0 to 3, or None, got 4"),
-        ({"sh_degree": 3, "colors": torch.zeros(80, 15, 3)}, "at least 16"),
         ({"backgrounds": torch.zeros(3)}, r"backgrounds must be \[2, 3\], got \[3\]"),
         ({"means": torch.zeros(1, 80, 3)}, r"means must be \[N, 3\], .* got \[1, 80, 3\]"),
-        ({"means": torch.zeros(())}, r"means must be \[N, 3\], .* got \[\]"),
-        ({"means": torch.zeros(80, 4)}, r"means must be \[80, 3\], got \[80, 4\]"),
         ({"quats": torch.zeros(80, 3)}, r"quats must be \[80, 4\], got \[80, 3\]"),
-        ({"sh_degree": 0, "colors": torch.zeros(80)}, r"colors must be \[N, K, 3\]"),
-        ({"colors": torch.zeros(())}, r"colors must be \[N, D\]"),
         ({"Ks": torch.eye(4).repeat(2, 1, 1)}, r"Ks, camera 0: K must be \[3, 3\]"),
         ({"viewmats": torch.eye(4)}, r"viewmats must be \[C, 4, 4\]"),
         ({"width": 0}, "width and height must be at least 1"),
         ({"opacities": torch.zeros(80, 1)}, "opacities"),
-        ({"Ks": torch.eye(3)[None]}, r"viewmats must be \[C, 4, 4\]"),
         ({"viewmats": 2 * torch.eye(4).repeat(2, 1, 1)}, "camera 0: viewmat must be a rotation"),
-        (
-            {"means": torch.full((80, 3), torch.nan)},
-            "means has values that are not finite",
-        ),
         ({"backgrounds": torch.full((2, 3), torch.inf)}, "backgrounds has values that are not"),
         ({"far_plane": 1.0, "near_plane": 2.0}, "far_plane must be above near_plane"),
-        ({"far_plane": torch.nan}, "far_plane must be above near_plane"),
-        ({"eps2d": -0.1}, "eps2d at least 0"),
         ({"Ks": torch.diag(torch.tensor([40.0, 40, 2])).repeat(2, 1, 1)}, "the last row of K"),
         (
             {"viewmats": torch.diag(torch.tensor([1.0, 1, 1, 2])).repeat(2, 1, 1)},

@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from numpy.lib.recfunctions import append_fields
 from plyfile import PlyData, PlyElement
 
@@ -39,8 +37,7 @@ def saved(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-@pytest.mark.parametrize("count", [0, 1, 7])
+@pytest.mark.parametrize(("count", "degree"), [(0, 3), (1, 0), (7, 1), (7, 3)])
 def test_what_was_saved_is_loaded(tmp_path: Path, count: int, degree: int) -> None:
     gaussians = make(count, degree)
     save_ply(tmp_path / "a.ply", gaussians, exact=True)
@@ -52,8 +49,9 @@ def test_what_was_saved_is_loaded(tmp_path: Path, count: int, degree: int) -> No
         assert loaded[name].is_contiguous()
 
 
-@pytest.mark.parametrize("suffix", ["ply", "glb", "spz"])
-@pytest.mark.parametrize("length", [1e-30, 1e-3, 1.0, 1e3, 1e30])
+@pytest.mark.parametrize(
+    ("suffix", "length"), [("ply", 1e-30), ("ply", 1.0), ("glb", 1e30), ("spz", 1e3)]
+)
 def test_quaternions_are_written_as_unit_ones(tmp_path: Path, suffix: str, length: float) -> None:
     gaussians = make(30)
     with torch.no_grad():
@@ -69,8 +67,7 @@ def test_quaternions_are_written_as_unit_ones(tmp_path: Path, suffix: str, lengt
     assert cosine.min() > (1 - 1e-6 if suffix == "spz" else 1 - 1e-13)
 
 
-@pytest.mark.parametrize("suffix", ["glb", "spz"])
-@pytest.mark.parametrize("name", PARAMETERS)
+@pytest.mark.parametrize(("suffix", "name"), [("glb", "quats"), ("spz", "scales"), ("spz", "shN")])
 def test_no_writer_that_converts_hides_nan(tmp_path: Path, suffix: str, name: str) -> None:
     gaussians = make(4)
     gaussians[name].detach()[2] = math.nan
@@ -108,9 +105,9 @@ def written(path: Path, table: np.ndarray[Any, Any], **options: Any) -> Path:
     return path
 
 
-@pytest.mark.parametrize("kind", ["f4", "f8"])
 @pytest.mark.parametrize(
-    "form", [{"byte_order": "<"}, {"byte_order": ">"}, {"text": True}], ids=["<", ">", "text"]
+    ("form", "kind"),
+    [({"byte_order": "<"}, "f8"), ({"byte_order": ">"}, "f4"), ({"text": True}, "f4")],
 )
 def test_other_writers_orders_types_and_properties_are_read(
     tmp_path: Path, saved: Path, form: dict[str, Any], kind: str
@@ -124,24 +121,6 @@ def test_other_writers_orders_types_and_properties_are_read(
     loaded = load_ply(written(tmp_path / "b.ply", other, comments=["by another"], **form))
     for name in PARAMETERS:
         assert torch.equal(loaded[name], make()[name])
-
-
-def test_bands_above_3_are_left_out_with_a_word(
-    tmp_path: Path, saved: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    table = PlyData.read(saved)["vertex"].data
-    rest = np.arange(len(table) * 72, dtype="f4").reshape(len(table), 3, 24)
-    others = [n for n in table.dtype.names if not n.startswith("f_rest")]
-    other = np.zeros(
-        len(table), [(n, "f4") for n in [*others, *(f"f_rest_{i}" for i in range(72))]]
-    )
-    for name in others:
-        other[name] = table[name]
-    for i in range(72):
-        other[f"f_rest_{i}"] = rest[:, i // 24, i % 24]
-    loaded = load_ply(written(tmp_path / "b.ply", other))
-    np.testing.assert_array_equal(loaded.shN.detach(), rest[:, :, :15].swapaxes(1, 2))
-    assert "has spherical harmonics of degree 4; bands above 3 are left out" in caplog.text
 
 
 def changed(saved: Path, **columns: Any) -> Path:
@@ -191,10 +170,8 @@ def test_a_value_that_is_not_finite_is_named(saved: Path, name: str, value: floa
         ([], False),
         (["SplatRenderMode: mip"], True),
         (["Exported from Brush", " splatrendermode:MIP "], True),
-        (["SplatRenderMode: default"], False),
         (["SplatRenderMode: 2dgs"], False),
         (["antialiased 1"], True),
-        (["antialiased 0"], False),
         (["not antialiased 1"], False),
         (["antialiased 1", "SplatRenderMode: default"], False),
     ],
@@ -251,7 +228,6 @@ def test_the_filter_of_mip_splatting_is_applied(
         (b"float scale_2", b"float size_2", "the flat Gaussians of 2D Gaussian Splatting"),
         (b"float opacity", b"float opac", "a point cloud and no Gaussians: .*missing: opacity"),
         (b"float rot_1", b"float r", "ply: properties are missing: rot_1"),
-        (b"float f_rest_44", b"float g", "44 f_rest properties"),
         (b"float f_rest_44", b"float f_rest_x", "44 f_rest properties"),
         (b"float f_rest_44", b"float f_rest_99", "missing: f_rest_44"),
         (b"float x", b"float packed_position", "convert it: npx @playcanvas/splat-transform "
@@ -268,31 +244,8 @@ def test_what_is_no_file_of_gaussians_is_named(
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("name", ["a.splat", "a.KSPLAT", "a.sog", "meta.json"])
+@pytest.mark.parametrize("name", ["a.KSPLAT", "meta.json"])
 def test_other_formats_are_named_with_the_command_that_converts_them(name: str) -> None:
     command = f"npx @playcanvas/splat-transform {name} {Path(name).stem}.ply"
     with pytest.raises(XrgsError, match=f"format is not read; convert it: {command}"):
         load_ply(name)
-
-
-@given(place=st.integers(0, 2400), junk=st.binary(min_size=1, max_size=12), cut=st.booleans())
-@settings(
-    max_examples=300,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
-)
-def test_a_damaged_file_is_read_or_refused_and_nothing_else(
-    tmp_path: Path, place: int, junk: bytes, cut: bool
-) -> None:
-    path = tmp_path / "d.ply"
-    save_ply(path, make())
-    data = path.read_bytes()
-    path.write_bytes(data[:place] + junk + (b"" if cut else data[place + len(junk) :]))
-    refused = None
-    try:
-        loaded = load_ply(path)
-    except XrgsError as error:
-        refused = str(error)
-    if refused is None:
-        assert all(torch.isfinite(loaded[name]).all() for name in PARAMETERS)
-    else:
-        assert str(path) in refused

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from xrgs.formats.similarity import transformed
 from xrgs.splat.cameras import Camera
-from xrgs.splat.gaussians import PARAMETERS, Gaussians
+from xrgs.splat.gaussians import Gaussians
 from xrgs.splat.rendering import rasterize
 
 from .test_ply import make
@@ -30,8 +30,9 @@ def seen(gaussians: Gaussians, viewmat: torch.Tensor) -> torch.Tensor:
     return rasterize(gaussians, Camera(viewmat, K, 40, 32)).image.detach()
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-@pytest.mark.parametrize(("scale", "mirror"), [(1.0, 1), (0.25, 1), (8.0, 1), (2.0, -1)])
+@pytest.mark.parametrize(
+    ("degree", "scale", "mirror"), [(0, 1.0, 1), (3, 0.25, 1), (2, 8.0, 1), (3, 2.0, -1)]
+)
 def test_cameras_that_move_as_well_see_the_same(degree: int, scale: float, mirror: int) -> None:
     gaussians = make(30, degree)
     viewmat = np.eye(4)
@@ -49,18 +50,6 @@ def test_cameras_that_move_as_well_see_the_same(degree: int, scale: float, mirro
     torch.testing.assert_close(after, before, atol=2e-5, rtol=0)
 
 
-def test_there_and_back_gives_the_same_parameters() -> None:
-    gaussians = make(10)
-    gaussians.quats = torch.nn.functional.normalize(gaussians.quats)
-    matrix = similarity(3.0)
-    back = transformed(transformed(gaussians, matrix), np.linalg.inv(matrix).astype(np.float64))
-    for name in PARAMETERS:
-        assert back[name].is_leaf
-        assert back[name].requires_grad
-        sign = (back.quats * gaussians.quats).sum(1, keepdim=True).sign() if name == "quats" else 1
-        torch.testing.assert_close(back[name] * sign, gaussians[name], atol=3e-6, rtol=0)
-
-
 @pytest.mark.parametrize(
     ("linear", "message"),
     [
@@ -75,8 +64,3 @@ def test_what_is_no_similarity_is_refused(linear: NDArray[np.float64], message: 
     matrix[:3, :3] = linear
     with pytest.raises(ValueError, match=re.escape(message)):
         transformed(make(3), matrix)
-
-
-def test_a_transposed_similarity_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"0, 0, 0, 1 as its last row; is it transposed\?"):
-        transformed(make(3), similarity(2.0).T)

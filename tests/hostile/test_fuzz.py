@@ -18,7 +18,7 @@ import time
 import warnings
 import zlib  # pycolmap corrupts the heap where it is imported before zlib
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -26,8 +26,10 @@ from random import Random
 
 import msgspec
 import numpy as np
+import pillow_heif
 import pycolmap
 import pytest
+import tifffile
 import torch
 
 from tests import reference_store
@@ -44,7 +46,6 @@ from xrgs import composing
 from xrgs.errors import StoreError, XrgsError
 from xrgs.evaluation.lpips import weights
 from xrgs.formats.files import load_gaussians, save_gaussians
-from xrgs.formats.ply import load_ply
 from xrgs.mixture import colmap, poses, saved_variant
 from xrgs.mixture.paths import read_failure
 from xrgs.mixture.photographs import PhotoCollection, prepare_hr_views
@@ -54,16 +55,18 @@ from xrgs.photos.scenes.rendered import RenderedScene
 from xrgs.runtime import lease, progress
 from xrgs.safeio import npz
 from xrgs.safeio.records import read_struct, read_table
+from xrgs.splat.gaussians import PARAMETERS
 from xrgs.store.archive import import_store
 from xrgs.store.schema import Identity, Provenance, Status, Summary, SweepRecord
 from xrgs.store.store import Store
 from xrgs.training.checkpoint import Checkpoint
 
+pillow_heif.register_heif_opener()
 MAX_CPU_S = 2.0
 #: Address space, in bytes, beyond what the process has; a file that needs more gets a MemoryError.
 _ADDRESS_SPACE = 1 << 30
 #: The most cuts of a file that are tried: at every byte of a small one, evenly spaced in others.
-_MAX_CUTS = 40
+_MAX_CUTS = 25
 
 
 @dataclass(frozen=True)
@@ -92,11 +95,28 @@ def photograph(form: str) -> Callable[[Path], bytes]:
 def deep(_: Path) -> bytes:
     """A PNG of 16 bits and alpha, with a profile."""
     samples = np.random.default_rng(0).integers(0, 65536, (7, 9, 4))
-    return png(samples, (b"iCCP", b"P3\0\0" + zlib.compress(profile("P3", 2.2, DISPLAY_P3))))
+    icc = b"P3\0\0" + zlib.compress(profile("P3", 2.2, DISPLAY_P3))
+    return png(samples, (b"sBIT", bytes([12] * 4)), (b"iCCP", icc))
 
 
-def look(file: Path) -> object:
-    return images.size(file), exif.read(file).camera, images.read(file)
+def deep_tiff(_: Path) -> bytes:
+    """A TIFF of 16 bits, with a profile."""
+    stream, samples = io.BytesIO(), np.linspace(0, 65535, 30 * 40 * 3).reshape(30, 40, 3)
+    icc = profile("P3", 2.2, DISPLAY_P3)
+    tifffile.imwrite(stream, samples.astype(np.uint16), photometric="rgb", iccprofile=icc)
+    return stream.getvalue()
+
+
+def look(file: Path) -> None:
+    size, _ = images.size(file), exif.read(file)
+    assert images.read(file).shape[1::-1] == size
+    with suppress(images.ImageError):
+        images.read_png(file)
+
+
+def finite(file: Path) -> None:
+    read = load_gaussians(file).gaussians
+    assert all(torch.isfinite(read[name]).all() for name in PARAMETERS)
 
 
 def of_store(pattern: str) -> Callable[[Path], bytes]:
@@ -122,7 +142,7 @@ def gaussians(suffix: str) -> Parser:
         save_gaussians(store / f"splats{suffix}", read.gaussians)
         return (store / f"splats{suffix}").read_bytes()
 
-    return Parser(valid, mutate_bytes, load_gaussians)
+    return Parser(valid, mutate_bytes, finite)
 
 
 def transforms(_: Path) -> bytes:
@@ -257,8 +277,10 @@ PARSERS = {
         for form in ("PNG", "JPEG", "BMP", "TIFF", "WEBP")
     },
     "deep.png": Parser(deep, mutate_image, look, (images.ImageError,)),
+    "deep.tif": Parser(deep_tiff, mutate_bytes, look, (images.ImageError,)),
+    "HEIF": Parser(photograph("HEIF"), mutate_bytes, look, (images.ImageError,)),
     **{f"splats{suffix}": gaussians(suffix) for suffix in (".glb", ".spz")},
-    "splats.ply": Parser(of_store("cells/*/splats.ply"), mutate_bytes, load_ply),
+    "splats.ply": Parser(of_store("cells/*/splats.ply"), mutate_bytes, finite),
     "points.ply": Parser(points, mutate_bytes, colmap.read_points),
     "transforms.json": Parser(transforms, mutate_json, poses_of),
     **{

@@ -70,8 +70,9 @@ def views_of(save: Save, configured: Make) -> Callable[..., list[View]]:
     return views
 
 
-@pytest.mark.parametrize(("noise", "quality"), [(0.0, 95), (2.0, 75)])
-@pytest.mark.parametrize("sigma", [0.0, 0.5, 0.8, 1.2])
+@pytest.mark.parametrize(
+    ("sigma", "noise", "quality"), [(0.0, 2.0, 75), (0.5, 0.0, 95), (0.8, 2.0, 75), (1.2, 2.0, 75)]
+)
 def test_a_known_blur_is_found_through_noise_and_jpeg(
     views_of: Callable[..., list[View]], sigma: float, noise: float, quality: int
 ) -> None:
@@ -94,27 +95,6 @@ def test_sharp_kernels_are_not_called_blurry(views_of: Callable[..., list[View]]
     assert not any(blur_notes(blur) for blur in found.values())
 
 
-def test_views_of_one_scale_are_compared_at_their_size(save: Save) -> None:
-    """Where nothing is degraded, the ratio of the sampling rates is the views' own."""
-    from scipy.ndimage import gaussian_filter
-
-    high = [texture(seed, 160, 200) for seed in range(4)]
-    low = [gaussian_filter(texture(seed, 160, 200), (0.9, 0.9, 0)) for seed in range(4, 8)]
-    sharp = [save(image, "HR", rho) for image, rho in zip(high, (0.9, 1.0, 1.0, 0.8), strict=True)]
-    views = [*sharp, *(save(image, "LR", 0.9) for image in low)]
-    assert estimated(views) == pytest.approx(0.9, abs=0.06)
-    assert estimated([replace(view, tag="LR") for view in sharp] + views[:2]) < 0.2
-
-
-def test_other_views_than_those_that_are_trained_on_do_not_count(
-    views_of: Callable[..., list[View]], save: Save
-) -> None:
-    views = views_of([texture(0)], [texture(1)], "box")
-    flat = np.full((80, 100, 3), 0.5, np.float32)
-    others = [replace(save(flat, "HR", 1.0), split=split) for split in ("test", "original")]
-    assert estimated([*views, *others]) == estimated(views)
-
-
 def test_without_both_classes_or_enough_pixels_nothing_is_said(
     views_of: Callable[..., list[View]],
 ) -> None:
@@ -126,34 +106,9 @@ def test_without_both_classes_or_enough_pixels_nothing_is_said(
     assert blur_notes(None) == []
 
 
-def test_what_a_mask_hides_does_not_count(
-    views_of: Callable[..., list[View]], save: Save, tmp_path: Path
-) -> None:
-    """A hidden half of noise, which a photograph keeps, is not taken for the scene's detail."""
-    high, low = [texture(seed) for seed in range(4)], [texture(seed) for seed in range(4, 8)]
-    *_, first, second, third, fourth = views_of(high, low, "box")
-    plain = estimated([*(save(image, "HR", 1.0) for image in high), first, second, third, fourth])
-    mask = np.ones((320, 400), np.bool_)
-    mask[:, :100] = False
-    images.save_mask(tmp_path / "mask.png", mask)
-    noise = np.random.default_rng(0).uniform(size=(320, 400, 3)).astype(np.float32)
-    masked = [
-        replace(
-            save(np.where(mask[..., None], image, noise), "HR", 1.0), mask=tmp_path / "mask.png"
-        )
-        for image in high
-    ]
-    assert estimated([*masked, first, second, third, fourth]) == pytest.approx(plain, abs=0.15)
-
-
-def test_a_view_of_one_colour_gives_a_number(save: Save) -> None:
-    flat = np.full((80, 100, 3), 0.5, np.float32)
-    assert estimated([save(flat, tag, 1.0) for tag in ("HR", "LR")]) == 0
-
-
-@pytest.mark.parametrize("scene", ["fern", "horns"])
 @pytest.mark.parametrize(
-    ("how", "expected"), [("downsample", None), ("lanczos", None), ("box", None), ("phone", 0.85)]
+    ("scene", "how", "expected"),
+    [("fern", "downsample", None), ("horns", "box", None), ("fern", "phone", 0.85)],
 )
 def test_on_photographs_a_phones_blur_is_found_and_no_other(
     views_of: Callable[..., list[View]],

@@ -13,16 +13,15 @@ from typing import Any
 import numpy as np
 import pycolmap
 import pytest
+import yaml
 
 from tests.photos.scene_confs import scene_conf
 from xrgs import config
 from xrgs.config import VariantConf
-from xrgs.errors import XrgsError
-from xrgs.mixture import mixing, sfm, sfm_retries
-from xrgs.mixture.degradations import DEGRADATIONS, resolve_degradation
+from xrgs.mixture import mixing, sfm
+from xrgs.mixture.degradations import DEGRADATIONS
 from xrgs.mixture.photographs import prepare_hr_views, write_degraded
 from xrgs.mixture.sfm import Reconstruction, SfmImage
-from xrgs.mixture.split import check_variant_conf
 from xrgs.mixture.tags import POLICIES
 from xrgs.mixture.views import SceneFailed, Variant, View
 from xrgs.photos import images, scenes
@@ -118,6 +117,7 @@ def number(view: View) -> int:
 def test_by_sampling_rate_the_highest_are_hr_and_nothing_is_degraded(
     mix: Mix, given: list[list[str]]
 ) -> None:
+    """The embedded scene's cameras are all about as far away: rho differs by 15 % at most."""
     made = mix(tags="sampling_rate")
     high, low = of(made, "train", "HR"), of(made, "train", "LR")
     assert len(high) == round(0.3 * 9)
@@ -129,13 +129,8 @@ def test_by_sampling_rate_the_highest_are_hr_and_nothing_is_degraded(
     assert made.report["degradation"] == "none"
     assert made.report["pose_error"] == {}
     assert made.report["rho"]["HR"][0] == min(v.sampling_rate for v in high)
-
-
-def test_photographs_of_one_resolution_are_said_to_make_no_mixture(mix: Mix) -> None:
-    """The embedded scene's cameras are all about as far away: rho differs by 15 % at most."""
-    made = mix(tags="sampling_rate")
     note, need = made.report["notes"]
-    rho = [view.sampling_rate for view in made.views if view.split == "train"]
+    rho = [view.sampling_rate for view in (*high, *low)]
     assert "variant.tags=sampling_rate is meaningless" in note
     assert f"rho is {min(rho):.3f} to {max(rho):.3f}" in note
     assert need == (
@@ -144,22 +139,21 @@ def test_photographs_of_one_resolution_are_said_to_make_no_mixture(mix: Mix) -> 
     )
 
 
-def test_a_threshold_of_the_rate_takes_those_above_it(mix: Mix) -> None:
-    made = mix(tags="sampling_rate", hr_above=0.93)
-    assert of(made, "train", "HR")
-    assert all(v.sampling_rate >= 0.93 for v in of(made, "train", "HR"))
-    assert all(v.sampling_rate < 0.93 for v in of(made, "train", "LR"))
-
-
-def test_by_distance_the_closest_are_hr(mix: Mix) -> None:
+def test_by_distance_the_closest_are_hr_and_the_others_are_degraded_after_sfm(
+    mix: Mix, given: list[list[str]]
+) -> None:
     """Every camera looks at one point, so that the exact cameras say which are close to it."""
-    made = mix(tags="distance")
+    made = mix(tags="distance", degradation="downsample")
+    assert given == [[f"sfm/{i:05d}.png" for i in range(VIEWS)]]
     poses = procedural.viewmats(VIEWS)
     middle = np.array([0.0, 0.1, 5.5, 1.0])
     depth = {v.name: (poses[number(v)] @ middle)[2] for v in made.views}
     high, low = ([depth[v.name] for v in of(made, "train", tag)] for tag in ("HR", "LR"))
     assert np.mean(high) < np.mean(low) - 0.2
     assert min(low) > min(high)
+    degraded = of(made, "train", "LR")
+    assert {(v.width, v.height) for v in degraded} == {(32, 24)}
+    assert [v.name for v in of(made, "original", "HR")] == [v.name for v in degraded]
 
 
 def test_by_megapixels_the_larger_photographs_are_hr(
@@ -181,17 +175,6 @@ def test_by_megapixels_the_larger_photographs_are_hr(
         assert (view.width, view.height) == ((160, 120) if number(view) % 3 == 0 else (80, 60))
 
 
-def test_photographs_of_one_class_alone_are_refused(mix: Mix, given: list[list[str]]) -> None:
-    with pytest.raises(XrgsError, match=r"variant\.tags=megapixels: every training view is HR at"):
-        mix(tags="megapixels")
-    assert given == []
-
-
-def test_a_threshold_above_all_but_the_held_out_is_named(mix: Mix) -> None:
-    with pytest.raises(XrgsError, match=r"variant\.hr_above=1\.0; their values are 0\.\d+ to"):
-        mix(tags="sampling_rate", hr_above=1.0, test_every=2)
-
-
 @pytest.mark.parametrize(("fraction", "tag"), [(0.0, "LR"), (1.0, "HR")])
 def test_one_class_alone_where_the_config_says_so(mix: Mix, fraction: float, tag: str) -> None:
     made = mix(hr_fraction=fraction)
@@ -203,9 +186,23 @@ def test_one_class_alone_where_the_config_says_so(mix: Mix, fraction: float, tag
 # degradations
 
 
-def test_each_degraded_view_has_its_original_from_the_same_pose(mix: Mix) -> None:
+def test_each_degraded_view_has_its_original_from_the_same_pose(
+    mix: Mix, given: list[list[str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And the poses are compared with those of the undegraded photographs."""
+    monkeypatch.setattr(mixing, "lr_blur", lambda _: 0.87)
     made = mix()
     low = of(made, "train", "LR")
+    (note,) = made.report["notes"]
+    assert note.startswith("LR photographs are blurrier than their pixels: by a Gaussian of 0.87")
+    assert made.report["lr_blur"] == 0.87
+    assert len(given) == 2
+    assert sum(file.startswith("sfm_lr_up/") for file in given[0]) == len(low)
+    assert given[1] == [f"sfm/{i:05d}.png" for i in range(VIEWS)]
+    assert made.report["pose_error"]["position_percent"] == pytest.approx(0, abs=1e-6)
+    assert made.report["pose_error_against"] == "SfM of the undegraded photographs"
+    assert made.report["reference"]["registered"] == VIEWS
+    assert made.report["reference"]["seconds"] >= 0
     originals = {view.name: view for view in of(made, "original", "HR")}
     assert sorted(originals) == [view.name for view in low]
     for view in low:
@@ -221,8 +218,13 @@ def test_each_degraded_view_has_its_original_from_the_same_pose(mix: Mix) -> Non
 
 
 @pytest.mark.parametrize("how", ["digital_zoom", "jpeg"])
-def test_a_degradation_may_keep_the_size(mix: Mix, given: list[list[str]], how: str) -> None:
+def test_a_degradation_may_keep_the_size(
+    mix: Mix, given: list[list[str]], monkeypatch: pytest.MonkeyPatch, how: str
+) -> None:
+    """Its views are blurry on purpose, which no note says."""
+    monkeypatch.setattr(mixing, "lr_blur", lambda _: 0.87)
     made = mix(degradation=how, hr_fraction=0.5)
+    assert not any("blurrier" in note for note in made.report["notes"])
     assert {(v.width, v.height) for v in made.views} == {(160, 120)}
     originals = {v.name: v for v in of(made, "original", "HR")}
     for view in of(made, "train", "LR"):
@@ -235,37 +237,6 @@ def test_a_degradation_may_keep_the_size(mix: Mix, given: list[list[str]], how: 
         assert view.supersampling == pytest.approx(resolved * originals[view.name].supersampling)
     low = {number(v) for v in of(made, "train", "LR")}
     assert given[0] == [f"{'sfm_lr' if i in low else 'sfm'}/{i:05d}.png" for i in range(VIEWS)]
-
-
-@pytest.mark.parametrize("how", ["box", "lanczos", "phone"])
-def test_lr_views_of_other_kernels_are_smaller(mix: Mix, given: list[list[str]], how: str) -> None:
-    made = mix(degradation=how, hr_fraction=0.5)
-    low = of(made, "train", "LR")
-    originals = {v.name: v for v in of(made, "original", "HR")}
-    assert {v.name for v in low} == originals.keys()
-    for view in low:
-        assert (view.width, view.height) == (32, 24)
-        assert view.sampling_rate == pytest.approx(originals[view.name].sampling_rate / 5)
-        high = images.read(originals[view.name].file)
-        assert 0 < np.abs(images.resize(high, 32, 24) - images.read(view.file)).mean() < 0.1
-    numbers = {number(v) for v in low}
-    expected = [f"{'sfm_lr_up' if i in numbers else 'sfm'}/{i:05d}.png" for i in range(VIEWS)]
-    assert given[0] == expected
-
-
-@pytest.mark.parametrize(("degradation", "said"), [("auto", True), ("digital_zoom", False)])
-def test_the_blur_of_lr_views_is_in_the_report_and_said(
-    mix: Mix, monkeypatch: pytest.MonkeyPatch, degradation: str, *, said: bool
-) -> None:
-    """A view that was zoomed on purpose is blurry on purpose."""
-    monkeypatch.setattr(mixing, "lr_blur", lambda _: 0.87)
-    made = mix(hr_fraction=0.5, degradation=degradation)
-    assert made.report["lr_blur"] == 0.87
-    if not said:
-        assert made.report["notes"] == []
-        return
-    (note,) = made.report["notes"]
-    assert note.startswith("LR photographs are blurrier than their pixels: by a Gaussian of 0.87")
 
 
 def test_noise_depends_on_a_views_name_and_on_the_seed_alone(
@@ -285,29 +256,7 @@ def test_noise_depends_on_a_views_name_and_on_the_seed_alone(
     assert written([0], seed=1)[0] != first[0]
 
 
-def test_views_tagged_after_sfm_can_be_degraded_after_it(mix: Mix, given: list[list[str]]) -> None:
-    made = mix(tags="distance", degradation="downsample")
-    assert given == [[f"sfm/{i:05d}.png" for i in range(VIEWS)]]
-    low = of(made, "train", "LR")
-    assert {(v.width, v.height) for v in low} == {(32, 24)}
-    assert [v.name for v in of(made, "original", "HR")] == [v.name for v in low]
-
-
 # poses
-
-
-def test_the_poses_are_compared_with_those_of_the_undegraded(
-    mix: Mix, given: list[list[str]]
-) -> None:
-    made = mix()
-    assert made.report["notes"] == []
-    assert len(given) == 2
-    assert sum(file.startswith("sfm_lr_up/") for file in given[0]) == len(of(made, "train", "LR"))
-    assert given[1] == [f"sfm/{i:05d}.png" for i in range(VIEWS)]
-    assert made.report["pose_error"]["position_percent"] == pytest.approx(0, abs=1e-6)
-    assert made.report["pose_error_against"] == "SfM of the undegraded photographs"
-    assert made.report["reference"]["registered"] == VIEWS
-    assert made.report["reference"]["seconds"] >= 0
 
 
 def test_exact_cameras_need_no_second_run_of_sfm(
@@ -317,52 +266,6 @@ def test_exact_cameras_need_no_second_run_of_sfm(
     assert len(given) == 1
     assert made.report["pose_error_against"] == "exact cameras"
     assert 0 < made.report["pose_error"]["position_percent"] < 5
-
-
-EMPTY = Reconstruction(
-    {},
-    {},
-    np.zeros((0, 3)),
-    np.zeros((0, 3), np.uint8),
-    {},
-    {"lr_images": "", "registered": 0, "models": [], "points": 0},
-)
-
-
-def test_a_refused_attempt_is_followed_by_the_next(
-    conf: VariantConf,
-    rendered: Scene,
-    reconstruction: Reconstruction,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    results = iter([EMPTY, reconstruction])
-    monkeypatch.setattr(sfm, "reconstruct", lambda *_: next(results))
-    (tmp_path / "out/images").mkdir(parents=True)
-    made = mixing.mix_resolutions(rendered, conf, tmp_path, tmp_path / "out")
-    attempts = made.report["attempts"]
-    assert [(a["attempt"], a["registered"]) for a in attempts] == [
-        ("configured", 0),
-        ("relaxed", VIEWS),
-    ]
-    assert "0 of 12 photographs are placed" in attempts[0]["refused"]
-    assert attempts[1]["refused"] == ""
-    assert made.report["registered"] == len({v.name for v in made.views}) == VIEWS
-
-
-def test_where_every_attempt_is_refused_the_report_has_them_all(
-    conf: VariantConf, rendered: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(sfm, "reconstruct", lambda *_: EMPTY)
-    (tmp_path / "out/images").mkdir(parents=True)
-    with pytest.raises(
-        SceneFailed, match="scene p failed: 0 of 12 photographs are placed"
-    ) as caught:
-        mixing.mix_resolutions(rendered, conf, tmp_path, tmp_path / "out")
-    tried = [a["attempt"] for a in caught.value.report["attempts"]]
-    attempts = sfm_retries.sfm_attempts(conf.sfm, VIEWS, any_smaller=True)
-    assert tried == [attempt.name for attempt in attempts]
-    assert tried[-1] == "native"
 
 
 def part(model: Reconstruction, views: int) -> Reconstruction:
@@ -377,7 +280,6 @@ def part(model: Reconstruction, views: int) -> Reconstruction:
     ("undegraded", "degradation", "said"),
     [
         (10, "downsample", "undegraded, 10 of 12 photographs are placed. To try: variant.factor=3"),
-        (5, "downsample", "undegraded, 5 of 12 photographs are placed. To try: variant.sfm.long"),
         (10, "none", "requires more. To try: variant.sfm.long_side=0 (the photographs have 160"),
     ],
 )
@@ -417,31 +319,13 @@ def test_a_failed_scene_says_who_is_missing_why_and_what_to_try(
 # the choices in conf/
 
 
-@pytest.mark.parametrize(
-    ("name", "tags", "degradation"),
-    [
-        ("box", "flag", "box"),
-        ("digital_zoom", "flag", "digital_zoom"),
-        ("distance", "distance", "none"),
-        ("jpeg", "flag", "jpeg"),
-        ("lanczos", "flag", "lanczos"),
-        ("megapixels", "megapixels", "none"),
-        ("phone", "flag", "phone"),
-        ("sampling_rate", "sampling_rate", "none"),
-        ("", "flag", "downsample"),
-    ],
-)
-def test_every_variant_in_conf_is_valid(
-    compose: Callable[..., config.Conf], name: str, tags: str, degradation: str
-) -> None:
-    conf = compose(*([f"variant={name}"] if name else [])).variant
-    check_variant_conf(conf)
-    assert (conf.tags, resolve_degradation(conf)) == (tags, degradation)
-
-
-def test_every_tag_and_degradation_has_a_variant_in_conf() -> None:
-    files = {file.stem for file in (config.CONF_DIR / "variant").iterdir()}
-    assert files == POLICIES.keys() | DEGRADATIONS.keys() - {"downsample"}  # the default
+def test_every_variant_in_conf_is_of_one_tag_or_degradation() -> None:
+    files = {file.stem: file for file in (config.CONF_DIR / "variant").iterdir()}
+    assert files.keys() == POLICIES.keys() | DEGRADATIONS.keys() - {"downsample"}  # the default
+    for name, file in files.items():
+        content = yaml.safe_load(file.read_text())
+        assert content.pop("tags" if name in POLICIES else "degradation") == name
+        assert content.keys() <= {"factor", "hr_above"}
 
 
 # what the user gives
@@ -486,52 +370,3 @@ def test_given_poses_replace_sfm_and_are_scaled_for_lr_views(
         assert scale in {1, 1 / 5}
         assert np.allclose(view.K, np.diag([scale, scale, 1]) @ exact, atol=1e-9)
     assert {v.name for v in of(made, "train", "LR")} == set(made.report["lr"]) - {names[-1]}
-
-
-def test_too_few_given_poses_are_refused(mix: Mix, rendered: Scene, tmp_path: Path) -> None:
-    write_poses(tmp_path / "poses", list(rendered.files)[:5])
-    with pytest.raises(
-        SceneFailed,
-        match=r"variant\.poses: 5 of 12 photographs are placed, 20 points; not placed: view_005",
-    ):
-        mix(poses=str(tmp_path / "poses"))
-
-
-def test_named_test_views_are_held_out(mix: Mix) -> None:
-    made = mix(test=["view_001", "view_006"], test_every=0)
-    assert {v.name for v in made.views if v.split == "test"} == {"view_001", "view_006"}
-    assert not {"view_001", "view_006"} & {v.name for v in made.views if v.split == "train"}
-    assert made.held_out
-
-
-# real photographs
-
-
-@pytest.mark.data
-def test_a_collection_of_many_cameras_is_registered(
-    configured: Make, data_root: Path, tmp_path: Path
-) -> None:
-    """Sixteen photographs of as many tourists, all of differing sizes, at a quarter of these."""
-    source = data_root / "captures" / "reichstag" / "images"
-    if not source.is_dir():
-        pytest.skip(f"{source} is not there")
-    files = tuple(sorted(source.iterdir())[:16])
-    sizes = [images.size(file) for file in files]
-    few = {"max_num_features": 1500, "long_side": 640}
-    conf = configured(long_side=320, tags="sampling_rate", factor=2, sfm=few)
-    (tmp_path / "out/images").mkdir(parents=True)
-    made = mixing.mix_resolutions(
-        Scene("reichstag", "", {file.stem: file for file in files}),
-        conf,
-        tmp_path,
-        tmp_path / "out",
-    )
-    assert made.report["registered"] >= 12
-    assert made.report["cameras"] == 16
-    scale = 320 / max(max(size) for size in sizes)
-    by_name = dict(zip((file.stem for file in files), sizes, strict=True))
-    for view in made.views:
-        width, height = by_name[view.name]
-        assert 0 <= round(width * scale) - view.width < 2
-        assert 0 <= round(height * scale) - view.height < 2
-    assert min(view.sampling_rate for view in made.views) < 0.8  # 0.72 when this was written

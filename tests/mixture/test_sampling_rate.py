@@ -26,15 +26,6 @@ def column(*depths: float) -> np.ndarray:
     return np.array([[0, 0, depth] for depth in depths], dtype=np.float64)
 
 
-def test_the_depth_is_the_median_of_the_observed_points() -> None:
-    points = column(1, 2, 3, 4, 5, 6, 7, 8, 9, 100, 100, 100)
-    own = np.arange(9)
-    assert sampling_rate.median_depth(points, np.eye(4), LENS, own) == 5
-    moved = np.eye(4)
-    moved[2, 3] = 10
-    assert sampling_rate.median_depth(points, moved, LENS, own) == 15
-
-
 @pytest.mark.parametrize(("count", "depth"), [(8, 4), (7, 30)])
 def test_eight_observed_points_are_enough_and_seven_are_not(count: int, depth: float) -> None:
     """Eight points at depth 4 are observed, among many at depth 30 inside the image."""
@@ -70,22 +61,6 @@ def test_a_view_without_points_gets_the_median_of_the_others() -> None:
         sampling_rate.median_depths(replace(model, viewmats={5: turned_away}))
 
 
-def test_the_rate_is_focal_length_over_depth() -> None:
-    """300 px at depth 4 are 75 px per unit, and 100 px at depth 2 are 50, which is 2/3 of it."""
-    K = {f: K_of(f, f) for f in (100.0, 300.0)}
-    rates = [sampling_rate.sampling_rate(K[300.0], 4), sampling_rate.sampling_rate(K[100.0], 2)]
-    assert rates == pytest.approx([75, 50])
-    assert sampling_rate.relative_to_largest(rates) == pytest.approx([1, 2 / 3])
-    assert sampling_rate.sampling_rate(K_of(40, 90), 3) == pytest.approx(20)
-
-
-def test_a_smaller_copy_has_a_lower_rate_by_its_factor() -> None:
-    small = LENS.resized(20, 16)
-    assert sampling_rate.sampling_rate(LENS.K, 3) == pytest.approx(
-        5 * sampling_rate.sampling_rate(small.K, 3)
-    )
-
-
 def test_distance_and_sampling_rate_can_disagree() -> None:
     """A far telephoto view has the higher sampling rate, a near wide-angle view the closer one."""
     views = [
@@ -100,27 +75,6 @@ def test_distance_and_sampling_rate_can_disagree() -> None:
     assert relative["sampling_rate"] == pytest.approx([1, np.nan, 2 / 3], nan_ok=True)
     assert relative["distance"] == pytest.approx([0.5, np.nan, 1], nan_ok=True)
     assert relative["megapixels"] == [1, 1, 0.25]
-
-
-def test_points_on_the_border_of_the_image_and_close_to_the_camera_count() -> None:
-    """Pixels 0 and 100 of 100 are the image's own border; depth is bounded by 0 alone."""
-    border = [[-50 / 90, 0, 1], [50 / 90, 0, 1], [0, -40 / 90, 1], [0, 40 / 90, 1]]
-    for point in border:
-        assert sampling_rate.median_depth(np.array([point]), np.eye(4), LENS) == 1
-        assert np.isnan(
-            sampling_rate.median_depth(1.02 * np.array([point]) - [0, 0, 0.02], np.eye(4), LENS)
-        )
-    assert sampling_rate.median_depth(column(0.25, 0.5, 0.75), np.eye(4), LENS) == 0.5
-
-
-def test_each_view_has_the_depth_of_the_points_that_it_observes() -> None:
-    points = column(*[4.0] * 8, *[6.0] * 8, *[9.0] * 40)
-    poses = {0: np.eye(4), 3: np.eye(4)}
-    observed = {0: np.arange(8), 3: np.arange(8, 16)}
-    model = Reconstruction(
-        dict.fromkeys(poses, LENS), poses, points, np.zeros((56, 3), np.uint8), observed, {}
-    )
-    assert sampling_rate.median_depths(model) == {0: 4, 3: 6}
 
 
 def rates_of(*cameras: tuple[float, float], points: np.ndarray) -> np.ndarray:
@@ -181,3 +135,32 @@ def test_a_view_that_alone_sees_its_points_needs_nothing_whatever_its_rate() -> 
 def test_a_tenth_of_the_views_makes_the_finest_rate(fine: int, need: float) -> None:
     rates = np.array([8.0] * fine + [1.0] * (40 - fine))[:, None] * np.ones(5)
     assert sampling_rate.needed_factors(rates, np.ones(40, dtype=bool))[-1] == need
+
+
+def test_the_depth_is_the_median_of_the_observed_points() -> None:
+    points = column(1, 2, 3, 4, 5, 6, 7, 8, 9, 100, 100, 100)
+    own = np.arange(9)
+    assert sampling_rate.median_depth(points, np.eye(4), LENS, own) == 5
+    moved = np.eye(4)
+    moved[2, 3] = 10
+    assert sampling_rate.median_depth(points, moved, LENS, own) == 15
+
+
+def test_the_rate_is_focal_length_over_depth() -> None:
+    """300 px at depth 4 are 75 px per unit, and 100 px at depth 2 are 50, which is 2/3 of it."""
+    K = {f: K_of(f, f) for f in (100.0, 300.0)}
+    rates = [sampling_rate.sampling_rate(K[300.0], 4), sampling_rate.sampling_rate(K[100.0], 2)]
+    assert rates == pytest.approx([75, 50])
+    assert sampling_rate.relative_to_largest(rates) == pytest.approx([1, 2 / 3])
+    assert sampling_rate.sampling_rate(K_of(40, 90), 3) == pytest.approx(20)
+
+
+def test_points_on_the_border_of_the_image_and_close_to_the_camera_count() -> None:
+    """Pixels 0 and 100 of 100 are the image's own border; depth is bounded by 0 alone."""
+    border = [[-50 / 90, 0, 1], [50 / 90, 0, 1], [0, -40 / 90, 1], [0, 40 / 90, 1]]
+    for point in border:
+        assert sampling_rate.median_depth(np.array([point]), np.eye(4), LENS) == 1
+        assert np.isnan(
+            sampling_rate.median_depth(1.02 * np.array([point]) - [0, 0, 0.02], np.eye(4), LENS)
+        )
+    assert sampling_rate.median_depth(column(0.25, 0.5, 0.75), np.eye(4), LENS) == 0.5

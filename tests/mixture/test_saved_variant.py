@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import errno
 import json
-import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -21,7 +18,7 @@ from xrgs.mixture import saved_variant
 from xrgs.mixture.saved_variant import CorruptVariant
 from xrgs.mixture.views import Variant, View
 from xrgs.photos import images
-from xrgs.safeio import checksums, npz
+from xrgs.safeio import checksums
 
 Edit = Callable[[dict[str, Any]], object]
 Write = Callable[..., Path]
@@ -79,12 +76,6 @@ def variant_id(content: dict[str, Any]) -> str:
         return str(content["id"])
 
 
-def test_an_intact_variant_is_loaded(write: Write) -> None:
-    folder = write()
-    assert [view.name for view in saved_variant.load(folder).views] == ["a", "b"]
-    assert saved_variant.verify(folder) == []
-
-
 def test_a_mask_is_hashed_and_a_variant_without_masks_has_no_word_of_them(tmp_path: Path) -> None:
     plain, masked = (make(tmp_path / name) for name in ("plain", "masked"))
     file = masked.folder / "images/test-masks/a.png"
@@ -111,10 +102,8 @@ def first_view(**changes: Any) -> Edit:
     ("edit", "named"),
     [
         (first_view(width=0), r"views\[0\]\.width: Expected `int` >= 1"),
-        (first_view(split="else"), r"views\[0\]\.split: Invalid enum value"),
         (first_view(tag="x"), r"views\[0\]\.tag: Invalid enum value"),
         (first_view(rho=0), r"views\[0\]\.rho: Expected `float` > 0"),
-        (first_view(need=0), r"views\[0\]\.need: Expected `float` > 0"),
         (first_view(K=[[1, 2], [3]]), r"views\[0\]\.K\[0\]: Expected `array` of length >= 3"),
         (first_view(mask="images/test-masks/a.png"), "files: they are not the view"),
         (first_view(more=1), r"views\[0\]: Object contains unknown field `more`"),
@@ -136,9 +125,7 @@ def test_a_wrong_value_in_the_list_is_named(write: Write, edit: Edit, named: str
     "arrays",
     [
         {"points": np.full((5, 3), np.nan), "colors": _COLORS},
-        {"points": np.full((5, 3), 1e308), "colors": _COLORS},
         {"points": np.ones((5, 3), np.float32), "colors": _COLORS},
-        {"points": np.float64(1), "colors": _COLORS},
         {"points": np.ones((3, 3)), "colors": _COLORS[:3]},
         {"points": np.ones((5, 3)), "colors": np.zeros((3, 3), np.uint8)},
         {"points": np.ones((5, 3)), "colors": np.zeros((5, 3))},
@@ -150,18 +137,11 @@ def test_wrong_points_are_refused(write: Write, arrays: dict[str, Any]) -> None:
         saved_variant.load(write(**arrays))
 
 
-def test_a_list_that_was_changed_after_freezing_is_refused(write: Write) -> None:
-    folder = write()
-    file = folder / "variant.json"
-    file.write_text(file.read_text().replace('"factor": 5', '"factor": 4'))
-    with pytest.raises(CorruptVariant, match=r"variant\.json: it has changed"):
-        saved_variant.load(folder)
-
-
 def test_a_variant_is_known_by_the_name_of_its_folder(
     write: Write, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = write()
+    assert [view.name for view in saved_variant.load(folder).views] == ["a", "b"]
     (tmp_path / "link").symlink_to(folder)
     assert saved_variant.load(tmp_path / "link").id == folder.name  # a user may name it by a link
     monkeypatch.chdir(folder)
@@ -171,10 +151,15 @@ def test_a_variant_is_known_by_the_name_of_its_folder(
         saved_variant.load(tmp_path / "key-other")
     trimmed = shutil.copytree(folder, tmp_path / f"trimmed-{folder.name}")
     assert saved_variant.read_manifest(trimmed).id == folder.name
+    file = folder / "variant.json"
+    file.write_text(file.read_text().replace('"factor": 5', '"factor": 4'))
+    with pytest.raises(CorruptVariant, match=r"variant\.json: it has changed"):
+        saved_variant.load(folder)
 
 
 def test_verifying_names_every_file_that_is_not_as_it_was(write: Write) -> None:
     folder = write()
+    assert saved_variant.verify(folder) == []
     (folder / "images/test/a.png").unlink()
     (folder / "images/train/b.png").write_bytes(b"changed")
     (folder / "notes.txt").write_text("mine")
@@ -188,7 +173,7 @@ def test_verifying_names_every_file_that_is_not_as_it_was(write: Write) -> None:
     assert saved_variant.verify(folder) == [f"{folder}/variant.json: No such file or directory"]
 
 
-@pytest.mark.parametrize("name", ["points.npz", "images/test/a.png", "variant.json", "report.json"])
+@pytest.mark.parametrize("name", ["points.npz", "images/test/a.png", "report.json"])
 def test_a_file_that_cant_be_read_now_says_nothing_of_the_variant(
     write: Write, name: str, unreadable: Callable[[str], None]
 ) -> None:
@@ -198,16 +183,6 @@ def test_a_file_that_cant_be_read_now_says_nothing_of_the_variant(
         saved_variant.load(folder)
     (line,) = saved_variant.verify(folder)
     assert f"{name}: Input/output error" in line
-
-
-def test_a_disk_that_fails_within_the_points_says_nothing_of_the_variant(
-    write: Write, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = write()
-    failure = OSError(errno.EIO, os.strerror(errno.EIO))
-    monkeypatch.setattr(npz, "read", Mock(side_effect=failure))
-    with pytest.raises(UnreadableError, match=r"points\.npz: Input/output error; try again"):
-        saved_variant.load(folder)
 
 
 def test_everything_is_on_the_disk_before_the_variant_has_its_name(

@@ -15,10 +15,8 @@ from scipy.ndimage import map_coordinates
 from skimage import data
 
 from xrgs.config import VariantConf
-from xrgs.errors import XrgsError
 from xrgs.mixture import poses, triangulation
 from xrgs.mixture.photographs import PhotoCollection, prepare_hr_views
-from xrgs.photos import images
 from xrgs.photos.scenes import Scene
 
 SIZE = (240, 180)
@@ -90,17 +88,3 @@ def test_points_of_distorted_and_turned_photographs_are_on_the_wall(
     assert found.report["reprojection_error_px"] < 0.5
     assert found.lenses == model.lenses
     assert all(len(found.observed[i]) > 20 for i in range(4))
-
-
-@pytest.mark.slow
-def test_photographs_that_show_no_points_are_named(
-    photos: PhotoCollection, tmp_path: Path, configured: Callable[..., VariantConf]
-) -> None:
-    model = poses.read_poses(str(tmp_path / "poses"), photos)
-    for i in range(4):
-        width, height = photos.size("hr", i)
-        images.save(
-            photos.folder / photos.file("hr", i), np.full((height, width, 3), 0.5, np.float32)
-        )
-    with pytest.raises(XrgsError, match="has no points, and 0 were found in the photographs"):
-        triangulation.with_points(model, photos, (), configured().sfm, tmp_path)

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tests.photos.scene_confs import scene_conf
-from xrgs.config import SceneConf
 from xrgs.mixture.views import Variant, View
 from xrgs.photos import images
 
@@ -39,34 +37,19 @@ def test_every_8th_view_is_held_out_and_a_fraction_of_the_rest_stays_hr(
     made = procedural_variant
     assert made.held_out
     assert made.factor == 5
-    assert [v.name for v in select(made, "test", "HR")] == ["view_000", "view_008", "view_016"]
-    assert len(select(made, "train", "HR")) == round(0.3 * 21)
-    assert len(select(made, "train", "LR")) == 21 - round(0.3 * 21)
-    assert len([v for v in made.views if v.split != "original"]) == 24
+    assert [v.name for v in select(made, "test", "HR")] == ["view_000", "view_008"]
+    assert len(select(made, "train", "HR")) == round(0.3 * 14)
+    assert len(select(made, "train", "LR")) == 14 - round(0.3 * 14)
+    assert len([v for v in made.views if v.split != "original"]) == 16
     assert [(v.split, v.name) for v in made.views] == sorted((v.split, v.name) for v in made.views)
-
-
-def test_images_have_the_size_of_their_tag(procedural_variant: Variant) -> None:
-    for view in procedural_variant.views:
-        expected = (250, 185) if view.tag == "HR" else (50, 37)
-        assert (view.width, view.height) == expected
-        assert images.size(view.file) == expected
 
 
 def test_the_cameras_are_the_exact_ones_up_to_a_similarity(procedural_variant: Variant) -> None:
     """At 250 px, 0.8% and 0.17 degrees were measured; all HR, intrinsics known, gives 0.46%."""
     error = procedural_variant.report["pose_error"]
-    assert procedural_variant.report["registered"] == 24
+    assert procedural_variant.report["registered"] == 16
     assert error["position_percent"] < 1.5
     assert error["rotation_degrees"] < 0.4
-
-
-def test_an_lr_camera_is_the_hr_camera_at_a_fifth_of_the_size(procedural_variant: Variant) -> None:
-    high = select(procedural_variant, "train", "HR")[0]
-    low = select(procedural_variant, "train", "LR")[0]
-    small, _ = project(procedural_variant.points, low)
-    large, _ = project(procedural_variant.points, replace(low, K=high.K))
-    assert small * 5 == pytest.approx(large, abs=1e-6)
 
 
 def test_points_have_the_colour_of_the_pixels_they_project_to(procedural_variant: Variant) -> None:
@@ -83,22 +66,13 @@ def test_points_have_the_colour_of_the_pixels_they_project_to(procedural_variant
         assert np.median(np.abs(shown - expected)) < 0.5 * np.median(np.abs(shown - other))
 
 
-def test_rho_is_the_sampling_rate_over_the_largest(procedural_variant: Variant) -> None:
-    rho = {(view.split, view.name): view.sampling_rate for view in procedural_variant.views}
-    assert max(rho.values()) == 1
-    for view in select(procedural_variant, "train", "LR"):
-        assert view.sampling_rate == pytest.approx(rho["original", view.name] / 5)
-    report = procedural_variant.report["rho"]
-    assert 0 < report["LR"][0] < report["LR"][2] <= 0.2 + 1e-9 < report["HR"][0] <= 1
-
-
 def test_the_report_says_how_sfm_went(procedural_variant: Variant) -> None:
     report = procedural_variant.report
     assert report["points"] == len(procedural_variant.points) > 300
     assert len(procedural_variant.points) == len(procedural_variant.colors)
     assert 0 < report["reprojection_error_px"] < 1.5
     assert report["not_registered"] == []
-    assert report["hr_sizes"] == {"250x185": 24}
+    assert report["hr_sizes"] == {"250x185": 16}
     assert report["seconds"] > 0
     assert "Feature extraction" in (procedural_variant.folder / "colmap.log").read_text()
 
@@ -128,43 +102,21 @@ def test_one_pose_at_two_sizes_shows_one_image(stereo_variant: Variant) -> None:
     assert np.abs(shrunk.clip(0, 1) - images.read(low.file)).max() <= 0.5 / 255 + 1e-6
 
 
-def test_known_intrinsics_follow_the_resize_and_the_crop(
-    stereo_scene: SceneConf, build: Build
-) -> None:
-    """741 x 500 px are resized to 204 x 138, and cropped to 200 x 135 about the centre."""
-    built = build(stereo_scene, long_side=204)
-    left = next(v for v in built.views if v.name == "motorcycle_left" and v.split == "test")
-    assert (left.width, left.height) == (200, 135)
-    assert left.K[0] == pytest.approx([994.978 * 204 / 741, 0, 311.193 * 204 / 741 - 2])
-    assert left.K[1] == pytest.approx([0, 994.978 * 138 / 500, 254.877 * 138 / 500 - 1])
-
-
-def test_native_gives_sfm_the_small_files_as_they_are(
-    stereo_scene: SceneConf, build: Build
-) -> None:
-    built = build(stereo_scene, long_side=0, factor=2, sfm={"lr_images": "native"})
-    low = select(built, "train", "LR")[0]
-    (high,) = (v for v in select(built, "test", "HR") if v.name == low.name)
-    assert built.report["registered"] == 2
-    assert built.report["lr_images"] == "native"
-    assert [low.width * 2, low.height * 2] == [high.width, high.height] == [740, 500]
-    assert low.K[:2] * 2 == pytest.approx(high.K[:2])
-
-
 # photographs of users
 
 
 @pytest.mark.data
-def test_fern_is_registered_at_a_reduced_size(build: Build, data_root: Path) -> None:
-    path = data_root / "llff" / "fern"
-    if not path.is_dir():
-        pytest.skip(f"{path} is not there")
-    built = build(
-        scene_conf("folder", path, name="fern"),
-        sfm={"max_num_features": 2000, "long_side": 504},
-    )
-    assert built.report["registered"] == 20
-    assert len(select(built, "test", "HR")) == 3
-    assert len(select(built, "train", "HR")) == 5
+def test_photographs_of_fern_are_registered_at_a_reduced_size(
+    build: Build, data_root: Path, tmp_path: Path
+) -> None:
+    files = sorted((data_root / "llff" / "fern" / "images_4").glob("*"))[:6]
+    if not files:
+        pytest.skip("fern is not there")
+    for file in files:
+        images.save(tmp_path / "fern" / f"{file.stem}.png", images.read(file))
+    few = {"max_num_features": 1500, "long_side": 504}
+    built = build(scene_conf("folder", tmp_path / "fern", name="fern"), sfm=few)
+    assert built.report["registered"] == 6
+    assert len(select(built, "test", "HR")) == 1
     assert {(v.width, v.height) for v in select(built, "train", "LR")} == {(50, 37)}
-    assert len(built.points) > 250
+    assert len(built.points) > 100

@@ -56,8 +56,13 @@ def expected(values: Floats, primaries: tuple[tuple[float, float, float], ...]) 
     return encoded(values**GAMMA @ matrix.T)
 
 
-@pytest.mark.parametrize("primaries", [DISPLAY_P3, ADOBE_RGB])
-@pytest.mark.parametrize("suffix", ["png", "jpg", "tif", "webp", "heic"])
+@pytest.mark.parametrize(
+    ("suffix", "primaries"),
+    [
+        *(("png", DISPLAY_P3), ("jpg", ADOBE_RGB), ("tif", DISPLAY_P3), ("webp", ADOBE_RGB)),
+        ("heic", DISPLAY_P3),
+    ],
+)
 def test_a_profile_is_applied(
     tmp_path: Path, suffix: str, primaries: tuple[tuple[float, float, float], ...]
 ) -> None:
@@ -118,7 +123,7 @@ def test_8_bits_are_as_imagecms_gives_them(tmp_path: Path) -> None:
     assert np.array_equal(images.read(tmp_path / "a.png") * 255, expected)
 
 
-@pytest.mark.parametrize("suffix", ["png", "jpg", "tif", "webp"])
+@pytest.mark.parametrize("suffix", ["png", "jpg", "tif"])
 def test_srgb_and_no_profile_are_the_same_bits(tmp_path: Path, suffix: str) -> None:
     plain, tagged = tmp_path / f"a.{suffix}", tmp_path / f"b.{suffix}"
     Image.fromarray(smooth()).save(plain)
@@ -205,13 +210,6 @@ def test_cmyk_is_converted_by_its_profile(tmp_path: Path, form: str) -> None:
     assert np.abs(seen - inks().reshape(16, 3)).max() < 0.04
 
 
-def test_cmyk_of_16_bits_is_as_its_8_bits(tmp_path: Path) -> None:
-    samples = np.dstack([smooth(), smooth(1)[..., 0]])
-    tifffile.imwrite(tmp_path / "a.tif", samples.astype(np.uint16) * 257, photometric="separated")
-    plain = np.asarray(Image.fromarray(samples, "CMYK").convert("RGB")) / 255
-    assert np.abs(images.read(tmp_path / "a.tif") - plain).max() < 0.6 / 255
-
-
 def test_lab_is_as_scikit_image_gives_it(tmp_path: Path) -> None:
     grid = np.stack(np.meshgrid(range(120, 180, 10), range(-20, 21, 5), range(-20, 21, 5)), -1)
     stored = grid.reshape(1, -1, 3)
@@ -246,14 +244,13 @@ def p3(values: Floats) -> Floats:
     return encoded(decoded(values) @ P3_MATRIX.T)
 
 
-@pytest.mark.parametrize("bits", [8, 16])
 @pytest.mark.parametrize(
-    ("chunks", "truth", "note"),
+    ("bits", "chunks", "truth", "note"),
     [
-        ([GAMMA_1], encoded, "converted from gamma 1 to sRGB"),
-        ([(b"cICP", bytes([12, 13, 0, 1]))], p3, "converted from Display P3 to sRGB"),
-        ([GAMMA_SRGB, chrm(P3_XY)], p3, "converted from the primaries of cHRM to sRGB"),
-        ([(b"cICP", bytes([1, 8, 0, 1]))], encoded, "converted from linear sRGB to sRGB"),
+        (8, [GAMMA_1], encoded, "converted from gamma 1 to sRGB"),
+        (8, [(b"cICP", bytes([12, 13, 0, 1]))], p3, "converted from Display P3 to sRGB"),
+        (16, [GAMMA_SRGB, chrm(P3_XY)], p3, "converted from the primaries of cHRM to sRGB"),
+        (16, [(b"cICP", bytes([1, 8, 0, 1]))], encoded, "converted from linear sRGB to sRGB"),
     ],
 )
 def test_colours_that_a_png_names_are_converted(
@@ -271,14 +268,12 @@ def test_colours_that_a_png_names_are_converted(
 @pytest.mark.parametrize(
     "chunks",
     [
-        [],
-        [GAMMA_SRGB],
         [GAMMA_SRGB, chrm(SRGB_XY)],
         [(b"sRGB", b"\0"), GAMMA_1, chrm(P3_XY)],
         [(b"cICP", bytes([1, 13, 0, 1])), GAMMA_1],
         [(b"gAMA", bytes(4))],
-        [chrm((0,) * 8)],
         [chrm((0.3,) * 8)],
+        *([(b"cICP", bytes([1, transfer, 0, 1]))] for transfer in (1, 6, 14, 15, 2)),
     ],
 )
 def test_a_png_that_names_srgb_or_nothing_valid_is_read_as_it_is(
@@ -288,16 +283,6 @@ def test_a_png_that_names_srgb_or_nothing_valid_is_read_as_it_is(
     picture = images.decode(tmp_path / "a.png")
     assert np.array_equal(picture.pixels, smooth().astype(np.float32) / np.float32(255))
     assert picture.notes == ()
-
-
-@pytest.mark.parametrize(("transfer", "name"), [(16, "PQ"), (18, "HLG")])
-def test_hdr_is_refused_by_name(tmp_path: Path, transfer: int, name: str) -> None:
-    samples = np.round(smooth() / 255 * 65535)
-    (tmp_path / "a.png").write_bytes(png(samples, (b"cICP", bytes([9, transfer, 0, 1]))))
-    with pytest.raises(
-        ImageError, match=rf"a\.png: its brightness is HDR \({name}\); save it as SDR"
-    ):
-        images.decode(tmp_path / "a.png")
 
 
 #: The chromaticities of red, green, blue and white by H.273's numbers (its table 2).
@@ -346,11 +331,12 @@ CURVES: dict[int, Callable[[Floats], Floats]] = {
 }
 
 
-@pytest.mark.parametrize("bits", [8, 16])
-@pytest.mark.parametrize("primaries", H273)
-@pytest.mark.parametrize("transfer", CURVES)
+@pytest.mark.parametrize(
+    ("primaries", "transfer", "bits"),
+    [*((number, 8, 16) for number in H273), *((12, number, 8) for number in CURVES)],
+)
 def test_the_numbers_of_cicp_are_converted(
-    tmp_path: Path, bits: int, primaries: int, transfer: int
+    tmp_path: Path, primaries: int, transfer: int, bits: int
 ) -> None:
     most = 255 if bits == 8 else 65535
     samples = np.round(smooth() / 255 * most)
@@ -361,15 +347,10 @@ def test_the_numbers_of_cicp_are_converted(
     assert np.abs(images.decode(tmp_path / "a.png").pixels - truth).max() < 0.1 / 255
 
 
-@pytest.mark.parametrize("transfer", [1, 6, 14, 15, 2])
-def test_curves_of_cameras_are_shown_as_srgbs(tmp_path: Path, transfer: int) -> None:
-    chunk = b"cICP", bytes([1, transfer, 0, 1])
-    (tmp_path / "a.png").write_bytes(png(smooth(), chunk, bits=8))
-    assert np.array_equal(images.decode(tmp_path / "a.png").pixels * 255, np.float32(smooth()))
-
-
-@pytest.mark.parametrize(("bits", "black", "white"), [(8, 16, 235), (16, 16 * 256, 235 * 256)])
-@pytest.mark.parametrize("channels", [1, 3, 4])
+@pytest.mark.parametrize(
+    ("bits", "black", "white", "channels"),
+    [(8, 16, 235, 1), (8, 16, 235, 4), (16, 16 * 256, 235 * 256, 3)],
+)
 def test_values_of_narrow_range_are_stretched(
     tmp_path: Path, bits: int, black: int, white: int, channels: int
 ) -> None:
@@ -393,6 +374,8 @@ def test_values_of_narrow_range_are_stretched(
 @pytest.mark.parametrize(
     ("numbers", "why"),
     [
+        ((9, 16, 0, 1), r"its brightness is HDR \(PQ\); save it as SDR"),
+        ((9, 18, 0, 1), r"its brightness is HDR \(HLG\); save it as SDR"),
         ((1, 9, 0, 1), "its brightness is logarithmic brightness"),
         ((1, 19, 0, 1), "its curve is number 19 of H.273"),
         ((13, 13, 0, 1), "its primaries are number 13 of H.273"),
@@ -405,21 +388,6 @@ def test_numbers_that_are_not_known_are_refused(
     (tmp_path / "a.png").write_bytes(png(smooth(), (b"cICP", bytes(numbers)), bits=8))
     with pytest.raises(ImageError, match=rf"a\.png: {why}"):
         images.decode(tmp_path / "a.png")
-
-
-@pytest.mark.parametrize("suffix", [".heic", ".avif"])
-def test_full_and_narrow_range_are_the_same_picture(tmp_path: Path, suffix: str) -> None:
-    """The two containers have YUV of either range, which their decoders read."""
-    pillow_heif.register_heif_opener()
-    flags: list[dict[str, Any]] = [{"full_range_flag": 1}, {"full_range_flag": 0}]
-    if suffix == ".avif":
-        flags = [{"range": "full", "subsampling": "4:4:4"}, {"range": "limited"}]
-    for i, flag in enumerate(flags):
-        more = {"chroma": 444} | flag if suffix == ".heic" else flag
-        picture = Image.fromarray(np.full((64, 64, 3), (235, 128, 16), np.uint8))
-        picture.save(tmp_path / f"{i}{suffix}", quality=100, **more)
-        pixels = images.decode(tmp_path / f"{i}{suffix}").pixels[32, 32] * 255
-        assert np.abs(pixels - (235, 128, 16)).max() <= 3
 
 
 @pytest.mark.parametrize(("primaries", "transfer"), [(12, 13), (1, 5), (9, 16)])
@@ -458,9 +426,7 @@ def test_the_profile_of_a_jpeg_2000_is_applied(tmp_path: Path) -> None:
     assert found.notes == ("converted from P3 to sRGB",)
 
 
-@pytest.mark.parametrize(
-    ("index", "space"), [("R03", 0xFFFF), ("R98", 1), (None, 2), (None, 0xFFFF)]
-)
+@pytest.mark.parametrize(("index", "space"), [("R03", 0xFFFF), ("R98", 1), (None, 2)])
 def test_a_camera_set_to_adobe_rgb_says_so_in_exif(
     tmp_path: Path, index: str | None, space: int
 ) -> None:
@@ -479,7 +445,7 @@ def test_a_camera_set_to_adobe_rgb_says_so_in_exif(
     assert picture.notes == ("converted from Adobe RGB to sRGB",)
 
 
-@pytest.mark.parametrize(("primaries", "transfer"), [(12, 13), (9, 16), (1, 13)])
+@pytest.mark.parametrize(("primaries", "transfer"), [(12, 13), (9, 16)])
 def test_heic_names_its_colours_by_number(tmp_path: Path, primaries: int, transfer: int) -> None:
     pillow_heif.register_heif_opener()
     Image.fromarray(smooth()).save(
@@ -498,3 +464,25 @@ def test_heic_names_its_colours_by_number(tmp_path: Path, primaries: int, transf
     values = smooth() / 255
     assert np.abs(picture.pixels - (p3(values) if primaries == 12 else values)).max() < 0.1 / 255
     assert len(picture.notes) == (primaries == 12)
+
+
+def test_cmyk_of_16_bits_is_as_its_8_bits(tmp_path: Path) -> None:
+    samples = np.dstack([smooth(), smooth(1)[..., 0]])
+    tifffile.imwrite(tmp_path / "a.tif", samples.astype(np.uint16) * 257, photometric="separated")
+    plain = np.asarray(Image.fromarray(samples, "CMYK").convert("RGB")) / 255
+    assert np.abs(images.read(tmp_path / "a.tif") - plain).max() < 0.6 / 255
+
+
+@pytest.mark.parametrize("suffix", [".heic", ".avif"])
+def test_full_and_narrow_range_are_the_same_picture(tmp_path: Path, suffix: str) -> None:
+    """The two containers have YUV of either range, which their decoders read."""
+    pillow_heif.register_heif_opener()
+    flags: list[dict[str, Any]] = [{"full_range_flag": 1}, {"full_range_flag": 0}]
+    if suffix == ".avif":
+        flags = [{"range": "full", "subsampling": "4:4:4"}, {"range": "limited"}]
+    for i, flag in enumerate(flags):
+        more = {"chroma": 444} | flag if suffix == ".heic" else flag
+        picture = Image.fromarray(np.full((64, 64, 3), (235, 128, 16), np.uint8))
+        picture.save(tmp_path / f"{i}{suffix}", quality=100, **more)
+        pixels = images.decode(tmp_path / f"{i}{suffix}").pixels[32, 32] * 255
+        assert np.abs(pixels - (235, 128, 16)).max() <= 3

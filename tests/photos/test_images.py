@@ -18,7 +18,6 @@ from tests.photos.made_files import (
     FLOAT,
     LONG,
     SHORT,
-    UNDEFINED,
     exif_entry,
     png,
     with_entry,
@@ -60,8 +59,18 @@ def test_a_saved_image_is_read_to_half_a_step(tmp_path: Path, noise: images.Imag
     assert np.abs(read - np.clip(noise * 1.2 - 0.1, 0, 1)).max() <= 0.5 / 255 + 1e-6
 
 
-@pytest.mark.parametrize("orientation", [*range(10), 255])
-@pytest.mark.parametrize("suffix", SAVED)
+@pytest.mark.parametrize(
+    ("suffix", "orientation"),
+    [
+        *(("png", orientation) for orientation in [*range(10), 255]),
+        *(
+            (suffix, orientation)
+            for suffix in SAVED
+            if suffix != "png"
+            for orientation in (2, 5, 6)
+        ),
+    ],
+)
 def test_exif_orientation_is_applied_once_to_image_and_size(
     tmp_path: Path, suffix: str, orientation: int
 ) -> None:
@@ -81,20 +90,15 @@ def test_exif_orientation_is_applied_once_to_image_and_size(
     assert (picture.orientation, images.header(file).orientation) == (applied, applied)
 
 
-@pytest.mark.parametrize("suffix", ["jpg", "png", "webp", "tif"])
+@pytest.mark.parametrize("suffix", ["jpg", "tif"])
 @pytest.mark.parametrize(
     ("kind", "count", "value", "applied"),
     [
-        (SHORT, 1, b"\6\0", 6),
         (LONG, 1, b"\6\0\0\0", 6),
         (SHORT, 2, b"\6\0\6\0", 6),
-        (FLOAT, 1, struct.pack("<f", 6), 6),
         (FLOAT, 1, struct.pack("<f", 6.5), 1),
-        (FLOAT, 1, struct.pack("<f", float("nan")), 1),
         (BYTE, 1, b"\6", 1),
         (ASCII, 2, b"6\0", 1),
-        (UNDEFINED, 4, b"\6\0\0\0", 1),
-        (SHORT, 1, b"\0\0", 1),
         (SHORT, 0, b"\6\0", 1),
     ],
 )
@@ -130,28 +134,6 @@ def test_exif_behind_the_pixels_of_a_png_is_found(tmp_path: Path) -> None:
         images.read(tmp_path / "a.png")
 
 
-def test_the_header_of_a_png_is_read_without_its_pixels(tmp_path: Path) -> None:
-    content = png(np.zeros((40, 60, 3)), bits=8)
-    (tmp_path / "a.png").write_bytes(content[:-40])
-    assert images.size(tmp_path / "a.png") == (60, 40)
-    with pytest.raises(ImageError, match=r"a\.png: unreadable or truncated"):
-        images.decode(tmp_path / "a.png")
-
-
-@pytest.mark.parametrize("mode", ["L", "LA", "P", "RGBA", "1", "CMYK"])
-def test_any_8_bit_photograph_is_read_as_rgb(tmp_path: Path, mode: str) -> None:
-    Image.new(mode, (20, 10)).save(tmp_path / "a.tif")
-    assert images.read(tmp_path / "a.tif").shape == (10, 20, 3)
-
-
-def test_a_truncated_file_is_named(tmp_path: Path, noise: images.ImageArray) -> None:
-    images.save(tmp_path / "a b.png", noise)
-    whole = (tmp_path / "a b.png").read_bytes()
-    (tmp_path / "a b.png").write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(ImageError, match=r"a b\.png: unreadable or truncated"):
-        images.read(tmp_path / "a b.png")
-
-
 def test_a_file_that_is_no_image_is_named(tmp_path: Path) -> None:
     (tmp_path / "a.png").write_text("hello")
     with pytest.raises(ImageError, match=r"a\.png"):
@@ -165,10 +147,6 @@ def test_shrinking_is_pillows_antialiased_bicubic(noise: images.ImageArray) -> N
     for c in range(3):
         band = Image.fromarray(noise[..., c]).resize((12, 8), Image.Resampling.BICUBIC)
         assert np.abs(small[..., c] - np.asarray(band)).max() < 5e-5
-
-
-def test_resizing_to_the_same_size_changes_nothing(noise: images.ImageArray) -> None:
-    assert images.resize(noise, 60, 40) is noise
 
 
 def transparent(mode: str) -> Image.Image:
@@ -189,7 +167,7 @@ def transparent(mode: str) -> Image.Image:
     ("suffix", "mode"),
     [
         *[("png", mode) for mode in ("RGBA", "LA", "P")],
-        *[("tif", mode) for mode in ("RGBA", "LA")],
+        ("tif", "RGBA"),
         ("webp", "RGBA"),
         ("heic", "RGBA"),
     ],
@@ -230,23 +208,7 @@ def test_premultiplied_colours_of_a_tiff_are_divided(tmp_path: Path) -> None:
     assert np.abs(images.read(tmp_path / "a.tif")[:, 40:] * 255 - 40).max() <= 0.6
 
 
-def test_alpha_is_turned_with_the_picture(tmp_path: Path) -> None:
-    exif = Image.Exif()
-    exif[0x0112] = 6
-    transparent("RGBA").save(tmp_path / "a.png", exif=exif)
-    picture = images.decode(tmp_path / "a.png")
-    assert picture.alpha is not None
-    assert picture.alpha.shape == (60, 40)
-    assert (picture.alpha[:20] == 0).all()
-
-
-@pytest.mark.parametrize("suffix", ["png", "webp", "tif"])
-def test_alpha_that_hides_nothing_is_none(tmp_path: Path, suffix: str) -> None:
-    Image.new("RGBA", (60, 40), (9, 9, 9, 255)).save(tmp_path / f"a.{suffix}", **SAVED[suffix])
-    assert images.decode(tmp_path / f"a.{suffix}").alpha is None
-
-
-@pytest.mark.parametrize("suffix", ["tif", "webp", "png", "mpo"])
+@pytest.mark.parametrize("suffix", ["tif", "png", "mpo"])
 def test_of_several_images_the_first_is_read_and_said(tmp_path: Path, suffix: str) -> None:
     """But for a JPEG's: phones add gain maps and depth."""
     first, other = (Image.new("RGB", (60, 40), colour) for colour in ("white", "black"))
@@ -261,9 +223,7 @@ def test_of_several_images_the_first_is_read_and_said(tmp_path: Path, suffix: st
 @pytest.mark.parametrize(
     ("content", "name"),
     [
-        (b"\xff\x0a" + bytes(20), "JPEG XL"),
         (b"\0\0\0\x0cJXL \r\n\x87\n", "JPEG XL"),
-        (b"8BPS" + bytes(20), "a Photoshop document"),
         (b"GIF89a" + bytes(20), "GIF"),
     ],
 )
@@ -273,13 +233,6 @@ def test_a_format_that_is_not_read_is_named(tmp_path: Path, content: bytes, name
         images.size(tmp_path / "a.jpg")
 
 
-def test_heic_is_read_with_its_camera(tmp_path: Path) -> None:
-    tags = Image.Exif()
-    tags[0x010F] = "Maker"
-    Image.new("RGB", (60, 40)).save(tmp_path / "a.heic", exif=tags.tobytes())
-    assert exif_of.read(tmp_path / "a.heic").camera == "Maker"
-
-
 def test_heic_without_its_package_says_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -287,3 +240,10 @@ def test_heic_without_its_package_says_what_to_install(
     (tmp_path / "a.heic").write_bytes(b"\0\0\0\x18ftypheic" + bytes(100))
     with pytest.raises(ImageError, match=r"a\.heic: .*pip install 'xrgs\[heic\]'"):
         images.size(tmp_path / "a.heic")
+
+
+def test_heic_is_read_with_its_camera(tmp_path: Path) -> None:
+    tags = Image.Exif()
+    tags[0x010F] = "Maker"
+    Image.new("RGB", (60, 40)).save(tmp_path / "a.heic", exif=tags.tobytes())
+    assert exif_of.read(tmp_path / "a.heic").camera == "Maker"

@@ -1,4 +1,4 @@
-"""Damaged photographs: they are read, or refused by their name, within bounds of memory."""
+"""Photographs that are refused by name, within bounds of memory; test_fuzz has damaged ones."""
 
 from __future__ import annotations
 
@@ -7,75 +7,15 @@ import io
 import os
 import tracemalloc
 import zlib
-from contextlib import suppress
 from pathlib import Path
-from typing import Any
 from unittest.mock import Mock
 
-import numpy as np
-import pillow_heif
 import pytest
-import tifffile
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from PIL import Image
 
-from tests.photos.made_files import DISPLAY_P3, SRGB, png, profile
 from xrgs.errors import UnreadableError
-from xrgs.photos import exif, images
+from xrgs.photos import images
 from xrgs.photos.images import ImageError
-
-pillow_heif.register_heif_opener()
-FAST = settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
-#: A change of valid bytes: where (as a fraction), how many are replaced, and by what.
-CHANGES = st.tuples(st.floats(0, 1), st.integers(0, 40), st.binary(max_size=12))
-
-
-def changed(content: bytes, change: tuple[float, int, bytes]) -> bytes:
-    fraction, count, new = change
-    start = int(fraction * len(content))
-    return content[:start] + new + content[start + count :]
-
-
-def photograph(kind: str) -> bytes:
-    stream = io.BytesIO()
-    exif = Image.Exif()
-    exif[0x0112], exif[0x0110] = 6, "a camera"
-    picture = Image.linear_gradient("L").resize((40, 30)).convert("RGB")
-    picture.save(stream, kind, exif=exif.tobytes(), icc_profile=profile("p", 2.2, DISPLAY_P3))
-    return stream.getvalue()
-
-
-def deep_tiff() -> bytes:
-    stream = io.BytesIO()
-    ramp = np.linspace(0, 65535, 30 * 40 * 3).astype(np.uint16).reshape(30, 40, 3)
-    tifffile.imwrite(stream, ramp, photometric="rgb", compression="lzw", iccprofile=SRGB)
-    return stream.getvalue()
-
-
-PHOTOGRAPHS = {kind: photograph(kind) for kind in ("PNG", "JPEG", "TIFF", "WEBP", "HEIF")} | {
-    "PNG of 16 bits": png(
-        np.linspace(0, 65535, 30 * 40 * 4).reshape(30, 40, 4),
-        (b"gAMA", (100_000).to_bytes(4, "big")),
-        (b"sBIT", bytes([12] * 4)),
-        (b"cICP", bytes([12, 13, 0, 1])),
-    ),
-    "TIFF of 16 bits": deep_tiff(),
-}
-
-
-@FAST
-@given(kind=st.sampled_from(sorted(PHOTOGRAPHS)), change=CHANGES)
-def test_a_damaged_photograph_is_read_or_refused(tmp_path: Path, kind: str, change: Any) -> None:
-    file = tmp_path / "a.png"
-    file.write_bytes(changed(PHOTOGRAPHS[kind], change))
-    for reader in (images.size, exif.read, images.read, images.read_png):
-        try:
-            reader(file)
-        except ImageError as error:
-            assert str(file) in str(error)  # noqa: PT017 - or it is read
-    with suppress(ImageError):
-        assert images.decode(file).pixels.shape[1::-1] == images.size(file)
 
 
 def test_an_encapsulated_postscript_program_is_not_run(tmp_path: Path) -> None:
@@ -124,16 +64,15 @@ def test_a_photograph_of_200_megapixels_is_admitted_and_a_larger_one_refused(
             reader(tmp_path / "a.bmp")
 
 
-@pytest.mark.parametrize("kind", ["BMP", "JPEG", "TIFF", "WEBP"])
-def test_images_of_stores_are_pngs_alone(tmp_path: Path, kind: str) -> None:
+def test_images_of_stores_are_pngs_alone(tmp_path: Path) -> None:
     file = tmp_path / "a.png"
-    Image.new("RGB", (9, 9)).save(file, kind)
+    Image.new("RGB", (9, 9)).save(file, "WEBP")
     assert images.read(file).shape == (9, 9, 3)
     with pytest.raises(ImageError, match=r"a\.png: .*cannot identify"):
         images.read_png(file)
 
 
-@pytest.mark.parametrize("mode", ["L", "P", "RGBA", "I;16", "1"])
+@pytest.mark.parametrize("mode", ["P", "RGBA"])
 def test_images_of_stores_have_8_bit_rgb_pixels_alone(tmp_path: Path, mode: str) -> None:
     Image.new(mode, (9, 9)).save(tmp_path / "a.png")
     with pytest.raises(ImageError, match=r"a\.png: .*not 8-bit RGB"):
@@ -145,7 +84,8 @@ def test_a_file_that_cant_be_read_now_is_not_called_damaged(
 ) -> None:
     """At once, or in the middle of its content."""
     file = tmp_path / "a.png"
-    file.write_bytes(PHOTOGRAPHS["PNG"])
+    Image.linear_gradient("L").convert("RGB").save(file)
+    content = file.read_bytes()
     failure = OSError(errno.EIO, os.strerror(errno.EIO))
 
     class Sick(io.BytesIO):
@@ -154,7 +94,7 @@ def test_a_file_that_cant_be_read_now_is_not_called_damaged(
                 raise failure
             return super().read(size)
 
-    for opened in (lambda *_: Sick(PHOTOGRAPHS["PNG"]), Mock(side_effect=failure)):
+    for opened in (lambda *_: Sick(content), Mock(side_effect=failure)):
         monkeypatch.setattr(Path, "open", opened)
         for reader in (images.read, images.read_png):
             with pytest.raises(UnreadableError, match=r"a\.png: Input/output error; try again"):
@@ -169,9 +109,3 @@ def test_a_large_photograph_has_the_bytes_for_its_pixels(tmp_path: Path) -> None
         images.read(tmp_path / "a.bmp")
     assert tracemalloc.get_traced_memory()[1] < 10_000_000
     tracemalloc.stop()
-
-
-def test_a_small_drawing_may_shrink_as_much_as_it_likes(tmp_path: Path) -> None:
-    Image.new("L", (4096, 4096)).save(tmp_path / "a.webp", lossless=True)
-    assert (tmp_path / "a.webp").stat().st_size < 3 * 4096**2 / 1032
-    assert images.read(tmp_path / "a.webp").shape == (4096, 4096, 3)

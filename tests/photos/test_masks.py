@@ -47,37 +47,25 @@ def noise(size: tuple[int, int], seed: int = 0) -> NDArray[np.uint8]:
 
 
 @pytest.mark.parametrize(
-    "name",
-    [
-        *("IMG_1.png", "IMG_1.jpg.png", "IMG_1.JPG.PNG", "IMG_1.bmp", "img_1.tiff", "IMG_1.jpg"),
-        *("IMG_1_mask.png", "mask_IMG_1.png", "IMG_1.mask.png", "IMG_1.jpg.mask.png"),
-    ],
-)
-def test_the_mask_of_a_photograph_is_found_by_its_name(tmp_path: Path, name: str) -> None:
-    save(tmp_path / name, np.zeros((4, 6), np.uint8))
-    found, notes = masks.find(str(tmp_path), {"IMG_1": Path("IMG_1.jpg")})
-    assert found == {"IMG_1": tmp_path / name}
-    assert notes == ()
-
-
-@pytest.mark.parametrize(
     ("photograph", "inside"),
     [
-        ("IMG.1", "IMG.1.png"),
+        ("IMG_1", "IMG_1.JPG.PNG"),
+        ("IMG_1", "img_1.tiff"),
+        ("IMG_1", "mask_IMG_1.png"),
+        ("IMG_1", "IMG_1.jpg.mask.png"),
         ("IMG.1", "IMG.1.jpg.png"),
-        ("IMG.jpg", "IMG.jpg.png"),
-        ("rig1_back_0004", "rig1/back/0004.png"),
         ("rig1_back_0004", "rig1/back/0004.jpg.png"),
         ("my mask", "my mask.png"),
         (unicodedata.normalize("NFD", "café"), unicodedata.normalize("NFC", "Café.png")),
     ],
 )
-def test_names_with_dots_folders_and_accents_are_found(
+def test_the_mask_of_a_photograph_is_found_by_its_name(
     tmp_path: Path, photograph: str, inside: str
 ) -> None:
     save(tmp_path / inside, np.zeros((4, 6), np.uint8))
-    found, _ = masks.find(str(tmp_path), {photograph: Path("x")})
+    found, notes = masks.find(str(tmp_path), {photograph: Path("x")})
     assert found == {photograph: tmp_path / inside}
+    assert notes == ()
 
 
 def test_photographs_without_masks_and_masks_without_photographs_are_said(tmp_path: Path) -> None:
@@ -90,14 +78,6 @@ def test_photographs_without_masks_and_masks_without_photographs_are_said(tmp_pa
         "no mask in scene.masks, so that all pixels are used: b, c",
         "masks of no photograph in scene.masks: z.png",
     )
-
-
-def test_masks_may_lie_beside_the_photographs(tmp_path: Path) -> None:
-    photographs = {name: save(tmp_path / f"{name}.jpg", noise((6, 4))) for name in "ab"}
-    save(tmp_path / "a.jpg.png", np.zeros((4, 6), np.uint8))
-    found, notes = masks.find(str(tmp_path), photographs)
-    assert found == {"a": tmp_path / "a.jpg.png"}
-    assert notes == ("no mask in scene.masks, so that all pixels are used: b",)
 
 
 @pytest.mark.parametrize(
@@ -115,9 +95,6 @@ def test_a_folder_that_can_not_be_meant_is_refused(
         (tmp_path / name).touch()
     with pytest.raises(XrgsError, match=message):
         masks.find(str(tmp_path), {"a": Path("x")})
-
-
-def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(XrgsError, match=r"scene\.masks=.*/none: no such folder"):
         masks.find(str(tmp_path / "none"), {"a": Path("x")})
 
@@ -131,14 +108,12 @@ def folder_scene(tmp_path: Path, count: int = 3) -> Any:
     )
 
 
-def test_masks_below_the_photographs_are_no_photographs(tmp_path: Path) -> None:
-    found = scenes.resolve(folder_scene(tmp_path), tmp_path)
+def test_the_fingerprint_of_a_scene_has_the_bytes_of_its_masks(tmp_path: Path) -> None:
+    """Masks below the photographs are no photographs."""
+    conf = folder_scene(tmp_path)
+    found = scenes.resolve(conf, tmp_path)
     assert list(found.files) == list(found.masks) == ["0", "1", "2"]
     assert found.notes == ()
-
-
-def test_the_fingerprint_of_a_scene_has_the_bytes_of_its_masks(tmp_path: Path) -> None:
-    conf = folder_scene(tmp_path)
     before = scenes.fingerprint(conf)
     assert before == scenes.fingerprint(replace(conf, masks=f"{tmp_path}/photos/../photos/m"))
     save(tmp_path / "photos" / "m" / "1.png", np.zeros((40, 60, 3), np.uint8))
@@ -159,10 +134,7 @@ def as_rgba(transparent: int) -> Image.Image:
 
 GREY = Image.fromarray(USED * np.uint8(255))
 FORMS: dict[str, tuple[Image.Image, str]] = {
-    "grey": (GREY, "png"),
     "1 bit": (GREY.convert("1"), "png"),
-    "RGB": (GREY.convert("RGB"), "png"),
-    "RGBA": (GREY.convert("RGBA"), "png"),
     "transparent where it is not used": (as_rgba(255), "png"),
     "palette": (GREY.convert("RGB").convert("P", palette=Image.Palette.ADAPTIVE), "png"),
     "a colour": (
@@ -170,12 +142,8 @@ FORMS: dict[str, tuple[Image.Image, str]] = {
         "png",
     ),
     "16 bits": (Image.fromarray(USED * np.uint16(65535)), "png"),
-    "labels 0 and 1": (Image.fromarray(USED.astype(np.uint8)), "png"),
     "labels 0 and 1 as RGB": (Image.fromarray(USED.astype(np.uint8)).convert("RGB"), "png"),
     "JPEG": (GREY, "jpg"),
-    "BMP": (GREY, "bmp"),
-    "TIFF": (GREY.convert("1"), "tiff"),
-    "half the size": (GREY.resize((30, 20)), "png"),
     "twice the size": (GREY.resize((120, 80)), "png"),
 }
 
@@ -210,28 +178,19 @@ def test_a_mask_that_may_be_a_photograph_is_said(tmp_path: Path) -> None:
     assert photos.notes == (f"{said}: a.png",)
 
 
-@pytest.mark.parametrize("size", [(50, 33), (50, 34), (1000, 667), (7, 5)])
-def test_a_mask_of_another_scale_may_have_a_rounded_side(
-    tmp_path: Path, size: tuple[int, int]
-) -> None:
-    file = save(tmp_path / "a.png", np.full((size[1], size[0]), 255, np.uint8))
-    assert read(file, save(tmp_path / "photo.png", noise((60, 40)))).shape == (40, 60)
-
-
-@pytest.mark.parametrize("size", [(60, 60), (40, 60), (60, 38), (30, 30)])
+@pytest.mark.parametrize("size", [(40, 60), (60, 38)])
 def test_a_mask_of_another_shape_is_refused_by_name(tmp_path: Path, size: tuple[int, int]) -> None:
     file = save(tmp_path / "a.png", np.zeros((size[1], size[0]), np.uint8))
     with pytest.raises(XrgsError, match=r"a\.png: a mask of .* than a, which has 60 x 40 px"):
         read(file, save(tmp_path / "photo.png", noise((60, 40))))
 
 
-@pytest.mark.parametrize("bits", ["1", "P", "L"])
 def test_a_mask_of_one_colour_is_read_however_small_its_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bits: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(images, "_SMALL_PIXELS", 0)
     file = tmp_path / "a.png"
-    Image.new("L", (2000, 1500), 255).convert(bits).save(file)
+    Image.new("1", (2000, 1500), 255).save(file)
     assert file.stat().st_size < 3 * 2000 * 1500 / 1032
     assert images.decode(file).pixels.min() == 1
 
@@ -254,13 +213,9 @@ CORNER = np.zeros((40, 60), np.bool_)
 CORNER[:10, :30] = True
 
 
-@pytest.mark.parametrize("orientation", range(1, 9))
-def test_a_mask_is_turned_as_its_photograph(orientation: int) -> None:
-    assert (images.turned(CORNER, orientation) == by_pil(CORNER, orientation)).all()
-
-
-@pytest.mark.parametrize("stored", [True, False])
-@pytest.mark.parametrize("orientation", [1, 2, 3, 4, 5, 6, 7, 8])
+@pytest.mark.parametrize(
+    ("orientation", "stored"), [*((turn, True) for turn in range(1, 9)), (3, False), (6, False)]
+)
 def test_one_mask_shows_how_all_of_a_folder_were_made(
     tmp_path: Path, orientation: int, stored: bool
 ) -> None:
@@ -307,11 +262,6 @@ def test_a_resized_pixel_is_used_where_all_that_it_is_made_of_is() -> None:
         assert (columns == np.flatnonzero(share >= 0.99)).all()
 
 
-def test_a_mask_of_the_size_that_is_wanted_is_the_same() -> None:
-    assert masks.resized(USED, 60, 40) is USED
-    assert masks.resized(None, 60, 40) is None
-
-
 def test_a_pixel_that_is_not_used_has_the_colour_of_the_nearest_one() -> None:
     image = noise((60, 40)).astype(np.float32)
     filled = masks.filled(image, USED)
@@ -353,9 +303,10 @@ LENS = Lens("SIMPLE_RADIAL", (50.0, 30.0, 20.0, 0.1), 60, 40)
 HIDDEN = st.integers(0, 2**32 - 1).map(lambda seed: noise((60, 40), seed))
 
 
-@pytest.mark.parametrize("alpha", [False, True])
-@pytest.mark.parametrize("degradation", ["downsample", "digital_zoom", "jpeg"])
-@settings(max_examples=4)
+@pytest.mark.parametrize(
+    ("degradation", "alpha"), [("downsample", False), ("digital_zoom", True), ("jpeg", False)]
+)
+@settings(max_examples=3)
 @given(hidden=HIDDEN)
 def test_what_is_hidden_changes_no_bit_of_what_is_trained_and_scored(
     tmp_path_factory: pytest.TempPathFactory,
@@ -381,15 +332,6 @@ def test_what_is_hidden_changes_no_bit_of_what_is_trained_and_scored(
         assert one.mask(kind, 1) is None
     hidden_now = one.undistorted("hr", 0, LENS)
     assert alpha or (hidden_now[0] != other.undistorted("hr", 0, LENS)[0]).any()
-
-
-def test_under_its_mask_an_hr_view_shows_the_photograph(tmp_path: Path) -> None:
-    photograph = noise((60, 40), 7)
-    photos = prepared(tmp_path / "x", photograph, USED)
-    image, used = photos.undistorted("hr", 0, Lens("PINHOLE", (50.0, 50.0, 30.0, 20.0), 60, 40))
-    assert used is not None
-    assert (used == USED).all()
-    assert (images.to_8_bit(image)[~used] == photograph[~used]).all()
 
 
 def test_a_mask_that_hides_nothing_changes_no_bit(tmp_path: Path) -> None:

@@ -45,20 +45,11 @@ def check(file: Path, samples: NDArray[Any], white: int = 65535, error: float = 
         assert np.abs(picture.alpha - alpha).max() < 1e-6
 
 
-@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(samples=SAMPLES, interlaced=st.booleans())
 def test_a_png_of_16_bits(tmp_path: Path, samples: NDArray[np.uint16], interlaced: bool) -> None:
     samples[0, 0] = 65535
     (tmp_path / "a.png").write_bytes(png(samples, interlaced=interlaced))
-    check(tmp_path / "a.png", samples)
-
-
-@pytest.mark.parametrize("filtering", [0, 1, 2, 3, 4])
-def test_a_png_of_16_bits_by_libpng(tmp_path: Path, filtering: int) -> None:
-    import imagecodecs
-
-    samples = np.random.default_rng(0).integers(0, 65536, (50, 70, 3)).astype(np.uint16)
-    (tmp_path / "a.png").write_bytes(imagecodecs.png_encode(samples, filter=filtering or None))
     check(tmp_path / "a.png", samples)
 
 
@@ -77,8 +68,7 @@ def test_the_transparent_colour_of_a_png_of_16_bits(tmp_path: Path, channels: in
 OPTIONS: dict[str, dict[str, Any]] = {
     "plain": {},
     "big endian": {"byteorder": ">"},
-    "LZW": {"compression": "lzw"},
-    "LZW, predictor": {"compression": "lzw", "predictor": True},
+    "LZW": {"compression": "lzw", "predictor": True},
     "LZW, predictor, big endian": {"compression": "lzw", "predictor": True, "byteorder": ">"},
     "deflate": {"compression": "zlib", "rowsperstrip": 7},
     "tiles": {"compression": "zlib", "predictor": True, "tile": (16, 16)},
@@ -87,17 +77,16 @@ OPTIONS: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS.keys())
-@pytest.mark.parametrize("channels", [1, 2, 3, 4])
-def test_a_tiff_of_16_bits(tmp_path: Path, options: dict[str, Any], channels: int) -> None:
+@pytest.mark.parametrize(
+    ("kind", "channels"),
+    [*((kind, 3) for kind in OPTIONS), ("plain", 1), ("tiles", 2), ("planes", 4), ("LZW", 4)],
+)
+def test_a_tiff_of_16_bits(tmp_path: Path, kind: str, channels: int) -> None:
     samples = np.random.default_rng(0).integers(0, 65536, (40, 60, channels)).astype(np.uint16)
-    has_planes = "planarconfig" in options and channels > 1
-    stored = samples.transpose(2, 0, 1).copy() if has_planes else samples
+    options = {"planarconfig": "contig"} | OPTIONS[kind]
+    stored = samples.transpose(2, 0, 1).copy() if kind == "planes" else samples
     if channels == 1:
-        stored = samples[..., 0]
-        options = {key: value for key, value in options.items() if key != "planarconfig"}
-    elif not has_planes:
-        options = options | {"planarconfig": "contig"}
+        stored, options = samples[..., 0], {}
     tifffile.imwrite(
         tmp_path / "a.tif",
         stored,
@@ -108,7 +97,7 @@ def test_a_tiff_of_16_bits(tmp_path: Path, options: dict[str, Any], channels: in
     check(tmp_path / "a.tif", samples)
 
 
-@pytest.mark.parametrize("bits", [10, 12, 14])
+@pytest.mark.parametrize("bits", [10, 14])
 def test_a_tiff_that_packs_bits_is_scaled_by_its_depth(tmp_path: Path, bits: int) -> None:
     samples = np.random.default_rng(0).integers(0, 1 << bits, (40, 60, 3)).astype(np.uint16)
     tifffile.imwrite(tmp_path / "a.tif", samples, photometric="rgb", bitspersample=bits)
@@ -152,7 +141,7 @@ def test_a_fourth_channel_without_a_word_is_alpha(
     check(tmp_path / "a.tif", samples, white)
 
 
-@pytest.mark.parametrize("orientation", range(10))
+@pytest.mark.parametrize("orientation", [0, 1, 3, 6, 7])
 def test_a_tiff_of_16_bits_is_turned_once(tmp_path: Path, orientation: int) -> None:
     """As Pillow turns the same picture of 8 bits."""
     picture = np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8)
@@ -168,14 +157,7 @@ def test_a_tiff_of_16_bits_is_turned_once(tmp_path: Path, orientation: int) -> N
         assert read.orientation == (orientation if orientation in range(1, 9) else 1)
 
 
-def test_white_is_zero(tmp_path: Path) -> None:
-    samples = np.random.default_rng(0).integers(0, 65536, (40, 60, 1)).astype(np.uint16)
-    tifffile.imwrite(tmp_path / "a.tif", 65535 - samples[..., 0], photometric="miniswhite")
-    check(tmp_path / "a.tif", samples)
-
-
-@pytest.mark.parametrize("bits", [10, 12])
-@pytest.mark.parametrize("channels", [1, 3, 4])
+@pytest.mark.parametrize(("bits", "channels"), [(10, 1), (10, 3), (12, 4)])
 def test_heic_of_10_and_12_bits(tmp_path: Path, bits: int, channels: int) -> None:
     white = (1 << bits) - 1
     samples = np.random.default_rng(0).integers(0, white + 1, (40, 60, channels))
@@ -192,8 +174,7 @@ def test_heic_of_10_and_12_bits(tmp_path: Path, bits: int, channels: int) -> Non
     check(tmp_path / "a.heic", samples, white, error=1e-5)
 
 
-@pytest.mark.parametrize("bits", [1, 8, 10, 12, 14])
-@pytest.mark.parametrize("suffix", ["png", "tif"])
+@pytest.mark.parametrize(("suffix", "bits"), [("png", 1), ("png", 14), ("tif", 12)])
 def test_the_low_bits_alone_are_refused(tmp_path: Path, suffix: str, bits: int) -> None:
     samples = np.full((9, 9, 3), (1 << bits) - 1, np.uint16)
     file = tmp_path / f"a.{suffix}"
@@ -219,20 +200,11 @@ def test_the_low_bits_are_scaled_where_the_file_counts_them(tmp_path: Path, suff
     assert images.decode(file).notes == ("scaled from 12 bits in 16",)
 
 
-def test_significant_bits_of_the_upper_ones_change_nothing(tmp_path: Path) -> None:
-    """PNG's own rule: samples of 12 bits are scaled to 16 when they are written."""
-    samples = np.random.default_rng(0).integers(0, 4096, (9, 9, 3)) * 16
-    (tmp_path / "a.png").write_bytes(png(samples, (b"sBIT", bytes([12, 12, 12]))))
-    check(tmp_path / "a.png", samples)
-
-
 @pytest.mark.parametrize(
     ("samples", "why"),
     [
         (np.zeros((9, 9, 3), np.float32), "float values of 32 bits have no white"),
-        (np.zeros((9, 9), np.float32), "float values of 32 bits have no white"),
         (np.zeros((9, 9, 3), np.uint32), "unsigned values of 32 bits have no white"),
-        (np.zeros((9, 9, 3), np.int16), "signed values of 16 bits have no white"),
         (np.zeros((9, 9), np.int8), "signed values of 8 bits have no white"),
     ],
 )
@@ -245,26 +217,15 @@ def test_values_without_a_white_are_refused(
         images.decode(tmp_path / "a.tif")
 
 
-@pytest.mark.parametrize(("channels", "is_deep_grey"), [(1, True), (2, False), (3, False)])
-@pytest.mark.parametrize("suffix", ["png", "tif"])
-def test_one_channel_of_16_bits_is_what_a_depth_map_has(
-    tmp_path: Path, suffix: str, channels: int, is_deep_grey: bool
-) -> None:
-    samples = np.full((9, 9, channels), 40_000, np.uint16)
-    file = tmp_path / f"a.{suffix}"
-    if suffix == "png":
-        file.write_bytes(png(samples))
-    else:
-        tifffile.imwrite(
-            file,
-            samples[..., 0] if channels == 1 else samples,
-            photometric="rgb" if channels == 3 else "minisblack",
-            planarconfig=None if channels == 1 else "contig",
-        )
-    assert images.header(file).is_deep_grey == is_deep_grey
+def test_one_channel_of_16_bits_is_what_a_depth_map_has(tmp_path: Path) -> None:
+    for channels in (1, 2, 3):
+        (tmp_path / "a.png").write_bytes(png(np.full((9, 9, channels), 40_000, np.uint16)))
+        assert images.header(tmp_path / "a.png").is_deep_grey == (channels == 1)
+    tifffile.imwrite(tmp_path / "a.tif", np.full((9, 9), 40_000, np.uint16))
+    assert images.header(tmp_path / "a.tif").is_deep_grey
 
 
-@pytest.mark.parametrize("compression", [None, "zlib", "lzw"])
+@pytest.mark.parametrize("compression", [None, "zlib"])
 def test_a_truncated_tiff_of_16_bits_is_refused(tmp_path: Path, compression: str | None) -> None:
     samples = np.random.default_rng(0).integers(0, 65536, (40, 60, 3)).astype(np.uint16)
     tifffile.imwrite(
@@ -286,6 +247,12 @@ def test_a_tiff_without_some_of_its_strips_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.tif").write_bytes(content[:place] + bytes(4) + content[place + 4 :])
     with pytest.raises(ImageError, match=r"a\.tif: unreadable or truncated image"):
         images.decode(tmp_path / "a.tif")
+
+
+def test_white_is_zero(tmp_path: Path) -> None:
+    samples = np.random.default_rng(0).integers(0, 65536, (40, 60, 1)).astype(np.uint16)
+    tifffile.imwrite(tmp_path / "a.tif", 65535 - samples[..., 0], photometric="miniswhite")
+    check(tmp_path / "a.tif", samples)
 
 
 def test_the_camera_of_a_tiff_of_16_bits_is_read(tmp_path: Path) -> None:

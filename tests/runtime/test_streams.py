@@ -51,8 +51,10 @@ def _full_disk() -> Iterator[int]:
         yield full.fileno()
 
 
-@pytest.mark.parametrize("gone", [_terminal, _pipe, _full_disk])
-@pytest.mark.parametrize("how", ["guard", "default"])
+@pytest.mark.parametrize(
+    ("gone", "how"),
+    [(_terminal, "guard"), (_pipe, "guard"), (_full_disk, "guard"), (_pipe, "default")],
+)
 def test_the_work_goes_on_without_a_reader(
     tmp_path: Path, gone: Callable[[], AbstractContextManager[int]], how: str
 ) -> None:
@@ -68,7 +70,7 @@ def test_the_work_goes_on_without_a_reader(
     assert (tmp_path / "done").exists() == (how == "guard")
 
 
-@pytest.mark.parametrize("closed", [(0,), (1,), (2,), (0, 1, 2)])
+@pytest.mark.parametrize("closed", [(1,), (0, 1, 2)])
 def test_a_file_never_gets_the_text_for_a_closed_stream(
     tmp_path: Path, closed: tuple[int, ...]
 ) -> None:
@@ -101,20 +103,6 @@ with open("file", "w") as file:
     assert (done.stdout, done.stderr) == ("" if 1 in closed else said, "" if 2 in closed else said)
 
 
-def test_text_is_printed_whatever_the_encoding_of_the_stream(tmp_path: Path) -> None:
-    script = (
-        "import sys\n"
-        "from xrgs.runtime.streams import guard_streams\n"
-        "guard_streams()\n"
-        "print('é ┃')\n"  # as help and bars, which do not go through `say`
-        "print('é ┃', file=sys.stderr)\n"
-    )
-    environment = os.environ | {"PYTHONIOENCODING": "ascii:strict"}
-    command = [sys.executable, "-c", script]
-    done = subprocess.run(command, capture_output=True, env=environment, check=True)
-    assert done.stdout == done.stderr == b"\\xe9 \\u2503\n"
-
-
 def test_a_terminal_that_draws_over_nothing_gets_lines(monkeypatch: pytest.MonkeyPatch) -> None:
     class Terminal(io.StringIO):
         def isatty(self) -> bool:
@@ -124,25 +112,6 @@ def test_a_terminal_that_draws_over_nothing_gets_lines(monkeypatch: pytest.Monke
         monkeypatch.setenv("TERM", term)
         say("a", terminal := Terminal())
         assert terminal.getvalue() == said
-
-
-def test_output_with_a_reader_is_complete(tmp_path: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", _SCRIPT, "guard"],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=True,
-        env=os.environ | {"PYTHONIOENCODING": "utf-8"},
-    )
-    assert (done.stdout, done.stderr) == ("text\n", "text\n")
-    assert (tmp_path / "done").read_text() == "False utf-8"
-
-
-def test_what_is_said_is_not_obeyed_and_keeps_its_lines() -> None:
-    stream = io.StringIO()
-    say("a\x1b[2J\n  b\r\u202ec", stream)
-    assert stream.getvalue() == "a [2J\n  b  c\n"
 
 
 def test_a_character_that_the_stream_lacks_is_a_number() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from xrgs.safeio.atomic import atomic_writer, write_json, write_text
+from xrgs.safeio.atomic import atomic_writer, write_text
 
 
 def test_the_new_content_appears_at_the_end_of_the_block(tmp_path: Path) -> None:
@@ -48,9 +48,3 @@ def test_only_a_durable_file_waits_for_the_disk(
     write_text(tmp_path / "file", "text", durable=durable)
     assert len(synced) == (2 if durable else 0)  # the content, and the name
     assert (tmp_path / "file").read_text() == "text"
-
-
-def test_json_has_sorted_keys_and_keeps_unicode(tmp_path: Path) -> None:
-    write_json(tmp_path / "file", {"b": [1.5, None], "a": "部屋"})
-    expected = '{\n "a": "部屋",\n "b": [\n  1.5,\n  null\n ]\n}\n'
-    assert (tmp_path / "file").read_text(encoding="utf-8") == expected

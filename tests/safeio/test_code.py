@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from xrgs.errors import XrgsError
-from xrgs.safeio.code import code_digest, digest_files, meaning, sources
+from xrgs.safeio.code import digest_files, meaning
 
 PYTHON = """\
 import math
@@ -74,11 +73,3 @@ def test_a_digest_is_of_names_and_meaning_and_of_the_files_now(tmp_path: Path) -
     assert digest_files({"a.py": file}) != first
     file.with_suffix(".bin").write_bytes(b"\xff")
     assert digest_files({"data": file.with_suffix(".bin")}) != first
-
-
-def test_a_folder_stands_for_every_source_file_below_it() -> None:
-    names = {file.name for file in sources("safeio")}
-    assert {"__init__.py", "code.py"} <= names
-    assert code_digest("safeio") != code_digest("safeio/code.py")
-    with pytest.raises(XrgsError, match=r"nothing\.py: this source file is missing"):
-        code_digest("nothing.py")

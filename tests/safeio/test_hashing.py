@@ -26,7 +26,7 @@ def test_a_config_becomes_the_dicts_of_asdict(compose: Callable[..., Conf]) -> N
     assert list(to_plain(conf)) == list(asdict(conf))
 
 
-@pytest.mark.parametrize("size", [0, 1, (1 << 16) - 1, 1 << 16, (1 << 17) + 1])
+@pytest.mark.parametrize("size", [0, 1 << 16, (1 << 17) + 1])
 def test_a_file_is_hashed_to_its_end(tmp_path: Path, size: int) -> None:
     content = b"ab" * (size // 2) + b"c" * (size % 2)
     (tmp_path / "file").write_bytes(content)

@@ -19,16 +19,6 @@ from xrgs.safeio import npz
 from xrgs.training.checkpoint import Checkpoint, CheckpointError
 
 FAST = settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
-#: A change of valid bytes: where (as a fraction), how many are replaced, and by what.
-CHANGES = st.tuples(st.floats(0, 1), st.integers(0, 40), st.binary(max_size=12))
-
-
-def changed(content: bytes, change: tuple[float, int, bytes]) -> bytes:
-    fraction, count, new = change
-    start = int(fraction * len(content))
-    return content[:start] + new + content[start + count :]
-
-
 ARRAYS = {
     "a": np.arange(6.0).reshape(2, 3),
     "by columns": np.asfortranarray(np.arange(6).reshape(2, 3)),
@@ -42,11 +32,6 @@ def packed(**arrays: Any) -> bytes:
     stream = io.BytesIO()
     np.savez(stream, allow_pickle=True, **arrays)
     return stream.getvalue()
-
-
-def test_a_member_without_the_suffix_has_its_own_name() -> None:
-    arrays = npz.read(io.BytesIO(archive(("a", npy()), ("b.npy", npy()))))
-    assert sorted(arrays) == ["a", "b"]
 
 
 def test_a_compressed_archive_is_refused() -> None:
@@ -111,18 +96,12 @@ def overlapping() -> bytes:
             "not the data that",
         ),
         (header("{'descr':'<f8','fortran_order':False,'shape':(-1,-1)}"), "negative"),
-        (
-            header("{'descr':'|V0','fortran_order':False,'shape':(1000000000000,)}"),
-            "not the data that",
-        ),
         (header("{'descr':'|O','fortran_order':False,'shape':(1,)}"), "not the data that"),
         (header("__import__('os').mkdir('trap')"), "malformed node"),
         (packed(a=np.array([{}], object)), "not the data that"),
         (overlapping(), "larger than the archive"),
         (b"", "not a zip file"),
-        (b"PK", "not a zip file"),
         (archive(("a", npy()), ("a.npy", npy())), "two members of one name"),
-        (archive(("a.npy", npy()), ("a.npy", npy())), "two members of one name"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",  # archives have the time in them
 )
@@ -130,17 +109,6 @@ def test_an_archive_that_declares_more_than_it_has_is_refused(content: bytes, wh
     with pytest.raises(ValueError, match=why):
         npz.read(io.BytesIO(content))
     assert not Path("trap").exists()
-
-
-@FAST
-@given(change=CHANGES)
-def test_a_damaged_archive_gives_arrays_or_a_value_error(change: Any) -> None:
-    content = changed(packed(**ARRAYS), change)
-    try:
-        found = npz.read(io.BytesIO(content))
-    except ValueError:
-        return
-    assert sum(array.nbytes for array in found.values()) <= len(content)
 
 
 @FAST

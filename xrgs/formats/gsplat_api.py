@@ -447,12 +447,9 @@ class _Renderer(NamedTuple):
     ) -> tuple[Tensor, Tensor]:
         """Render the channels [H, W, X] and alpha [H, W, 1] of one camera.
 
-        Args:
-            camera: The view.
-            colors: [N, K, 3] coefficients, or [N, D] colours.
-            offset: [N, 2] zeros, for the gradients of the projected means.
-            drawn: [N] bool, whether the Gaussian is drawn.
-            background: [D] colour behind the last Gaussian; None is black.
+        `colors` are coefficients [N, K, 3] or colours [N, D], `offset` zeros [N, 2] for the
+        gradients of the projected means, and `drawn` [N] bool. `background` is the colour [D]
+        behind the last Gaussian; None is black.
         """
         hidden = torch.where(drawn, self.shapes.opacities, 0.0)
         shapes = self.shapes._replace(opacities=hidden)

@@ -147,7 +147,8 @@ def read_ply(path: Path) -> SavedGaussians:
     opacities[np.isposinf(opacities)] = CERTAIN_LOGIT
     opacities[np.isneginf(opacities)] = -CERTAIN_LOGIT
     scales[np.isneginf(scales)] = FLAT_LOG_SCALE
-    antialiased = _is_antialiased(file.comments)
+    modes = [mode for text in file.comments if (mode := _RENDER_MODE.fullmatch(text.lower()))]
+    antialiased = bool(modes) and (modes[-1][1] == "mip" or modes[-1][2] == "1")
     if "filter_3D" in file.names:
         _log.warning("%s: the 3D filter of Mip-Splatting (filter_3D) is applied", path)
         sizes = file.columns(["filter_3D"], np.float64)
@@ -167,11 +168,6 @@ def read_ply(path: Path) -> SavedGaussians:
     return SavedGaussians(to_gaussians(values), antialiased)
 
 
-def _is_antialiased(comments: Sequence[str]) -> bool:
-    matches = [match for text in comments if (match := _RENDER_MODE.fullmatch(text.lower()))]
-    return bool(matches) and (matches[-1][1] == "mip" or matches[-1][2] == "1")
-
-
 def _properties(rest: int) -> list[str]:
     """Return the names of a vertex's properties, with `rest` SH coefficients above band 0."""
     return [
@@ -188,8 +184,7 @@ def _properties(rest: int) -> list[str]:
 def _columns(path: Path, names: Sequence[str]) -> list[str]:
     """Return the names of the file's properties for all parameters, in the order of `_properties`.
 
-    Raises:
-        XrgsError: Properties are missing; the message says what kind of file it seems to be.
+    If some are missing, XrgsError says what kind of file it seems to be.
     """
     if "packed_position" in names:
         raise XrgsError(

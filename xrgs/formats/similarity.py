@@ -23,16 +23,9 @@ _TOLERANCE = 1e-4
 def transformed(gaussians: Gaussians, similarity: NDArray[np.float64]) -> Gaussians:
     """Transform Gaussians to another world, so that transformed cameras see the same image.
 
-    Args:
-        gaussians: N Gaussians.
-        similarity: [4, 4] from the old world to the new one: a rotation, which may mirror, times a
-            scale above 0, and a translation.
-
-    Returns:
-        float32 leaf tensors that require gradients, with unit quaternions; computed in float64.
-
-    Raises:
-        ValueError: The matrix is not such a similarity.
+    `similarity` [4, 4] is from the old world to the new one: a rotation, which may mirror, times a
+    scale above 0, and a translation; ValueError for any other matrix. The result is computed in
+    float64: float32 leaf tensors that require gradients, with unit quaternions.
     """
     linear = similarity[:3, :3]
     determinant = float(np.linalg.det(linear)) if np.isfinite(similarity).all() else 0.0

@@ -73,15 +73,9 @@ def write_spz(path: Path, gaussians: Gaussians, *, antialiased: bool = False) ->
     outside -1..1, coordinates beyond 8 million. The file has the axes of the Gaussians' world,
     without rotation.
 
-    Args:
-        path: The file to write.
-        gaussians: The Gaussians.
-        antialiased: Whether to render them with `RasterSettings.antialiased`.
-
     Raises:
         XrgsError: A parameter is NaN, or a position, quaternion or coefficient is infinite; the
             message names it.
-        OSError: The file can't be written.
     """
     means, scales, sh0, shN = (
         value.detach().double().numpy()
@@ -92,7 +86,8 @@ def write_spz(path: Path, gaussians: Gaussians, *, antialiased: bool = False) ->
     values = (means, quats, scales.clip(*_LOG_SCALES), alpha, sh0, shN)
     check_arrays_finite(path, dict(zip(PARAMETERS, values, strict=True)))
     degree = round((shN.shape[1] + 1) ** 0.5) - 1
-    bits = _fraction_bits(float(np.abs(means).max(initial=0)))
+    _, exponent = np.frexp(np.abs(means).max(initial=0))  # the largest is below 2^exponent
+    bits = int(np.clip(_MAX_FRACTION - 1 - exponent, 0, _MAX_FRACTION))  # after the binary point
     flags = _ANTIALIASED if antialiased else 0
     limit = 2**_MAX_FRACTION - 1
     fixed = (means * 2.0**bits).round()
@@ -139,12 +134,6 @@ def _warn_of_clipped(
                 count,
                 len(values),
             )
-
-
-def _fraction_bits(largest: float) -> int:
-    """Return the number of fractional bits of the 24-bit coordinates, for the largest one."""
-    _, exponent = np.frexp(largest)  # the largest is below 2^exponent
-    return int(np.clip(_MAX_FRACTION - 1 - exponent, 0, _MAX_FRACTION))
 
 
 def _to_bytes(values: NDArray[np.float64]) -> Bytes:

@@ -37,7 +37,7 @@ _LUMA = np.array([0.299, 0.587, 0.114])
 
 
 def lr_blur(views: Sequence[View]) -> float | None:
-    """Estimate the blur of LR training views as the sigma of a Gaussian, LR px.
+    """Estimate the blur of LR training views as the sigma of a Gaussian, LR px; 0 or more.
 
     The power P of LR and HR views, in rings of frequencies f in cycles per LR px, is fitted by
 
@@ -46,13 +46,7 @@ def lr_blur(views: Sequence[View]) -> float | None:
     where log P is the mean over views. HR views are evaluated at the same frequencies in the scene,
     converted by the median sampling rates of both tags. The box of a pixel has a sigma of 0.29. The
     result is the blur in excess of that of HR views, which is small if these sample the scene much
-    more finely.
-
-    Args:
-        views: The views of a variant, with their files.
-
-    Returns:
-        sigma, 0 or more; None if a tag has no view that is large enough.
+    more finely. It is None if a tag has no view that is large enough.
     """
     hr, lr = (
         [view for view in views if (view.split, view.tag) == ("train", tag)] for tag in ("HR", "LR")
@@ -96,9 +90,7 @@ def _mean_log_power(views: Sequence[View], finer: float) -> Array | None:
 def _log_power(view: View, finer: float) -> Array:
     """Return the logarithm of the mean power of a view's luma in each ring.
 
-    Args:
-        view: The view.
-        finer: Its sampling rate over that of LR views.
+    `finer` is its sampling rate over that of LR views.
     """
     size = view.width, view.height
     pixels = np.asarray(images.read_png_pil(view.file, size))

@@ -74,14 +74,7 @@ def write_model(
     points: NDArray[np.float64],
     colors: NDArray[np.uint8],
 ) -> None:
-    """Write a binary COLMAP model without observations.
-
-    Args:
-        folder: An existing folder.
-        images: The images; each gets its own PINHOLE camera.
-        points: Points [P, 3].
-        colors: Colours of the points [P, 3].
-    """
+    """Write a binary COLMAP model of images, points [P, 3] and colours, without observations."""
     model = _with_points(points, colors)
     for number, image in enumerate(images, 1):
         K = image.K

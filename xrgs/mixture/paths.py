@@ -73,25 +73,16 @@ class _FailureReport(Struct):
 
 
 def read_failure(folder: Path) -> tuple[str, str]:
-    """Read the name of a failed scene, and the reason.
-
-    Raises:
-        UnreadableError: The report in the folder can't be read at the moment.
-        StoreError: The report is missing or damaged.
-    """
+    """Read the name of a failed scene, and the reason; StoreError if the report is damaged."""
     report = read_struct(folder / "report.json", _FailureReport)
     return report.scene, report.reason
 
 
 def failed_scenes(variants: Path) -> dict[str, tuple[str, str]]:
-    """List the failed scenes.
+    """List the failed scenes: key of the variant -> name of the scene, and the reason.
 
-    Returns:
-        Key of the variant -> name of the scene, and the reason. If a report can't be read, the name
-        is `?` and the reason is the error.
-
-    Raises:
-        OSError: The folder can't be read; it may be missing.
+    If a report can't be read, the name is `?` and the reason is the error. If the folder is missing
+    or can't be read, OSError is raised.
     """
     failed = {}
     for name in filter(is_failed, list_names(variants)):

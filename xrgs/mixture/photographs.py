@@ -141,12 +141,7 @@ class PhotoCollection:
     def undistorted(
         self, kind: str, index: int, lens: Lens
     ) -> tuple[images.ImageArray, Mask | None]:
-        """Undistort a copy, and its mask.
-
-        Args:
-            kind: `hr` or `lr`.
-            index: The photograph.
-            lens: The camera of the copy.
+        """Undistort a copy, `hr` or `lr`, and its mask; `lens` is the camera of the copy.
 
         Returns:
             The image [H, W, 3], not clamped; an HR view includes the masked pixels of the
@@ -167,13 +162,8 @@ def prepare_hr_views(
     """Decode every photograph once, and write an HR view of each usable photograph.
 
     All photographs are resized by the same factor, which preserves their ratios of resolution.
-    Unusable photographs are left out, and listed in the notes.
-
-    Args:
-        scene: The scene.
-        conf: The variant's config.
-        work: An existing folder for the copies.
-        for_sfm: Whether to write the `sfm` copies too.
+    Unusable photographs are left out, and listed in the notes. With `for_sfm` the `sfm` copies are
+    written too.
 
     Raises:
         UnreadableError: A photograph can't be read at the moment. It is not left out, since the
@@ -208,15 +198,10 @@ def prepare_hr_views(
 
 
 def expected_photographs(scene: Scene, conf: VariantConf) -> PhotoCollection:
-    """Predict the result of `prepare_hr_views` from the headers of the files.
+    """Predict the result of `prepare_hr_views`, without copies, from the headers of the files.
 
-    Returns:
-        The photographs, without copies, and a note on those that will be left out. Damage after a
-        header is not noticed.
-
-    Raises:
-        UnreadableError: A header can't be read at the moment.
-        XrgsError: As for `prepare_hr_views`.
+    A note names those that will be left out. Damage after a header is not noticed. It raises as
+    `prepare_hr_views` does.
     """
     headers, left_out = _read_headers(scene.files)
     usable = _usable(scene, conf, headers, left_out, lambda _: None)
@@ -447,12 +432,10 @@ def assign_cameras(
 ) -> list[str]:
     """Name the camera of each photograph; photographs with the same name share it in SfM.
 
-    Args:
-        files: The photographs.
-        sizes: Width and height of each photograph after applying the EXIF orientation, px. A camera
-            has one aspect ratio: held upright, it is a different camera for SfM.
-        policy: `variant.sfm.camera`: `single` for one camera, `per_image` for one for each
-            photograph, `auto` for one for each aspect ratio, EXIF camera, digital zoom and crop.
+    `sizes` are after EXIF's turn, px: a camera has one aspect ratio, and held upright it is a
+    different camera for SfM. `policy` is `variant.sfm.camera`: `single` for one camera, `per_image`
+    for one for each photograph, `auto` for one for each aspect ratio, EXIF camera, digital zoom and
+    crop.
 
     Raises:
         XrgsError: The policy is `single`, but the aspect ratios differ.
@@ -495,14 +478,11 @@ def write_degraded(
         if kind == "sfm_lr":  # HR views already have such a size
             size = _divisible(*photos.size("sfm", i), conf.factor)
             high, mask = images.resize(high, *size), masks.resized(mask, *size)
-        low = degrade(high, conf, _random(photos.names[i], conf))
+        # The random numbers of a view do not depend on the other views.
+        random = np.random.default_rng(int(digest([conf.seed, photos.names[i]]), 16))
+        low = degrade(high, conf, random)
         images.save(photos.folder / photos.file(kind, i), low, durable=False)
         photos.save_mask(kind, i, masks.degraded(mask, low.shape[:2], conf.factor))
-
-
-def _random(name: str, conf: VariantConf) -> np.random.Generator:
-    """Return the random generator of a view, which does not depend on the other views."""
-    return np.random.default_rng(int(digest([conf.seed, name]), 16))
 
 
 def _divisible(width: int, height: int, factor: int) -> tuple[int, int]:

@@ -11,14 +11,10 @@ Matrix = NDArray[np.float64]
 
 
 def fit_similarity(source: Matrix, target: Matrix) -> tuple[float, Matrix, Matrix]:
-    """Fit the similarity that minimises the sum over points of |s R source + t - target|².
+    """Fit the similarity that minimises the sum over points [N, 3] of |s R source + t - target|².
 
     Source: Umeyama 1991, "Least-squares estimation of transformation parameters between two point
     patterns".
-
-    Args:
-        source: Points [N, 3].
-        target: The corresponding points [N, 3].
 
     Returns:
         The scale s, the rotation R [3, 3] with det R = +1, and the translation t [3].

@@ -50,15 +50,11 @@ def not_placed(size: tuple[int, int]) -> Measures:
 def median_depth(
     points: Array, viewmat: Array, lens: Lens, observed: Sequence[int] | NDArray[np.intp] = ()
 ) -> float:
-    """Compute the median depth of the SfM points that a view observes.
+    """Compute the median depth of the SfM points [P, 3] that a view observes.
 
-    Args:
-        points: SfM points [P, 3].
-        viewmat: World to camera [4, 4].
-        lens: The view's camera, whose undistorted image is tested.
-        observed: Indices of the points that SfM observed in the view. Those behind the camera are
-            ignored. If fewer than 8 remain, all points in front of the camera that project into the
-            image are used instead.
+    Of the points that SfM `observed` in the view, those behind the camera are ignored. If fewer
+    than 8 remain, all points in front of the camera that project into the undistorted image are
+    used instead.
 
     Returns:
         The depth along the optical axis, world units; NaN without points.
@@ -79,10 +75,7 @@ def median_depth(
 def median_depths(model: Reconstruction) -> dict[int, float]:
     """Return index -> `median_depth`, of every registered view.
 
-    Views without points get the median of the other views.
-
-    Raises:
-        XrgsError: No view observes a point.
+    Views without points get the median of the other views; XrgsError if no view observes a point.
     """
     depths = {
         i: median_depth(model.points, viewmat, model.lenses[i], model.observed[i])
@@ -98,11 +91,9 @@ def median_depths(model: Reconstruction) -> dict[int, float]:
 
 
 def sampling_rate(K: Array, depth: float) -> float:
-    """Return the sampling rate nu, px per world unit.
+    """Return the sampling rate nu, px per world unit, of intrinsics [3, 3] and a median depth.
 
-    Args:
-        K: Intrinsics [3, 3], px. The focal length is the geometric mean over both axes.
-        depth: The median depth, world units.
+    The focal length is the geometric mean over both axes.
     """
     return float(np.sqrt(K[0, 0] * K[1, 1]) / depth)
 
@@ -154,14 +145,11 @@ def needed_factors(rates: Array, trained: Mask) -> list[float]:
 
     where r*(p) is the rate that a tenth of the training views that see p reach or exceed, at least
     one view. Our choice: the whole measure. With the maximum instead, a single close-up of a large
-    scene would decide for all other views.
+    scene would decide for all other views. A view that shares no point with a training view has 1.
 
     Args:
         rates: `point_rates` [V, P] of all views at the same points.
         trained: [V] bool, True for a training view.
-
-    Returns:
-        The factor of each view; 1 for a view that shares no point with a training view.
     """
     descending = -np.sort(-rates[trained], axis=0)
     rank = np.ceil(_FINEST_SHARE * (descending > 0).sum(axis=0)).astype(np.intp) - 1

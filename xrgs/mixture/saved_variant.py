@@ -86,7 +86,8 @@ class CorruptVariant(XrgsError):  # noqa: N818
 def freeze(made: Variant, key: str, folder: Path, variants: Path, code: dict[str, str]) -> Variant:
     """Write a variant's data into the folder of its images, and rename the folder to its id.
 
-    All files are synced to the disk before the folder is renamed.
+    All files are synced to the disk before the folder is renamed. The result is loaded from its
+    final folder.
 
     Args:
         made: The variant; its id is ignored.
@@ -94,9 +95,6 @@ def freeze(made: Variant, key: str, folder: Path, variants: Path, code: dict[str
         folder: The folder of its images, on the same disk as `variants`.
         variants: The parent of the final folder.
         code: Part of the code that made the variant -> its digest.
-
-    Returns:
-        The variant, loaded from its final folder.
     """
     with atomic_writer(folder / POINTS, durable=False) as stream:
         if np.array_equal(made.world, np.eye(4)):
@@ -154,12 +152,7 @@ def verify(folder: Path) -> list[str]:
 
 
 def read_manifest(folder: Path) -> Manifest:
-    """Read and check `variant.json`.
-
-    Raises:
-        UnreadableError: The file can't be read at the moment.
-        StoreError: The file is missing or damaged, or the folder's name is not the id.
-    """
+    """Read and check `variant.json`; StoreError if it is damaged or not of this folder."""
     file = folder / MANIFEST
     manifest = read_struct(file, Manifest)
     if manifest.id != manifest.computed_id():

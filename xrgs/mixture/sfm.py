@@ -102,11 +102,7 @@ def first_octave(long_side: int, configured: int | None) -> int:
     -1 detects features at twice the resolution, which is better for small images. On the embedded
     scene with mixed resolution, at 250 px and at 500 px, it gave 1.7 to 2 times as many points and
     3 to 21% less position error. For 37 photographs of bonsai (Mip-NeRF 360), HR at 800 px and LR
-    at 160 px, it placed 18 instead of 3.
-
-    Args:
-        long_side: The longest side of all images, px.
-        configured: The value of `variant.sfm.first_octave`.
+    at 160 px, it placed 18 instead of 3. `long_side` is the longest side of all images, px.
     """
     if configured is not None:
         return configured
@@ -181,12 +177,8 @@ def triangulate(
 ) -> Reconstruction:
     """Triangulate points from images with known cameras and poses, by exhaustive matching.
 
-    Args:
-        sfm_images: The images, each with `K` and its own camera.
-        viewmats: World to camera [4, 4] of each image.
-        folder: The folder that `SfmImage.file` is relative to.
-        work: An existing folder for COLMAP's database and logs.
-        conf: The settings.
+    Each image has `K` and its own camera, and `viewmats` its world to camera [4, 4]; the rest is as
+    for `reconstruct`.
     """
     _log_to(work)
     pycolmap.set_random_seed(conf.seed)
@@ -224,11 +216,7 @@ def bogus_cameras(model: Any, sfm_images: Sequence[SfmImage]) -> dict[int, str]:
     """Find images with an impossible camera, by COLMAP's limits for the parameters.
 
     COLMAP drops such images after every bundle adjustment except the last, so that the final model
-    may contain a negative focal length.
-
-    Args:
-        model: pycolmap's `Reconstruction`.
-        sfm_images: The images; those with `K` are not checked.
+    may contain a negative focal length. Images with `K` are not checked.
 
     Returns:
         Index of an image with an impossible camera -> the camera's parameters.
@@ -398,13 +386,8 @@ def mapping_options(conf: SfmConf, count: int, *, known: bool) -> Any:
 def to_numpy(model: Any, index: Mapping[str, int], report: Mapping[str, Any]) -> Reconstruction:
     """Convert pycolmap's `Reconstruction` into numpy arrays, with points in the order of their ids.
 
-    Args:
-        model: The model.
-        index: Name of an image in the model -> its index; other images are left out.
-        report: Entries of the report besides the results.
-
-    Raises:
-        XrgsError: A camera model is not supported.
+    `index` has the indices of the images by their names in the model; other images are left out.
+    `report` has entries besides the results. XrgsError if a camera model is not supported.
     """
     order = sorted(model.points3D)
     number = {point: p for p, point in enumerate(order)}

@@ -146,7 +146,11 @@ def register(
             _log.warning("SfM attempt %s: %s", attempt.name, reason)
         return model, reason, attempt
 
-    for attempt in _attempts(photos, degraded, conf):
+    any_smaller = any(
+        photos.size(_kind(i, degraded), i) != photo.sfm for i, photo in enumerate(photos.all)
+    )
+    any_focal = any(photo.focal_35mm and photo.K is None for photo in photos.all)
+    for attempt in sfm_attempts(conf, len(photos), any_smaller=any_smaller, any_focal=any_focal):
         found = run(attempt)
         if best is None or _rank(*found[:2]) > _rank(*best[:2]):
             best = found
@@ -185,16 +189,6 @@ def _notes(attempt: Attempt, photos: PhotoCollection) -> Iterator[str]:
         )
 
 
-def _attempts(
-    photos: PhotoCollection, degraded: Collection[int], conf: SfmConf
-) -> Iterator[Attempt]:
-    any_smaller = any(
-        photos.size(_kind(i, degraded), i) != photo.sfm for i, photo in enumerate(photos.all)
-    )
-    any_focal = any(photo.focal_35mm and photo.K is None for photo in photos.all)
-    yield from sfm_attempts(conf, len(photos), any_smaller=any_smaller, any_focal=any_focal)
-
-
 def _rank(model: sfm.Reconstruction, refused: str) -> tuple[bool, int]:
     return not refused, len(model.viewmats)
 
@@ -202,13 +196,10 @@ def _rank(model: sfm.Reconstruction, refused: str) -> tuple[bool, int]:
 def sfm_attempts(
     conf: SfmConf, images: int, *, any_smaller: bool, any_focal: bool = False
 ) -> Iterator[Attempt]:
-    """Yield the attempts to run SfM, in order.
+    """Yield the attempts to run SfM, in order; without `fallbacks` there is only the first.
 
-    Args:
-        conf: The settings of the first attempt; without `fallbacks` it is the only one.
-        images: The number of images.
-        any_smaller: Whether any image is smaller than its `Photograph.sfm`.
-        any_focal: Whether EXIF gives the focal length of any image.
+    `any_smaller` says whether any image is smaller than its `Photograph.sfm`, and `any_focal`
+    whether EXIF gives the focal length of any.
     """
     attempt = Attempt("configured", conf)
     yield attempt
@@ -231,13 +222,9 @@ def _features_of(attempt: Attempt) -> tuple[object, ...]:
 def sfm_images(
     photos: PhotoCollection, degraded: Collection[int], attempt: Attempt
 ) -> list[sfm.SfmImage]:
-    """Return the image of each photograph for SfM, with known intrinsics.
+    """Return the image of each photograph for SfM, with known intrinsics; make upsampled copies.
 
-    Args:
-        photos: The photographs, with `sfm` copies, and `sfm_lr` copies of the degraded views.
-            Upsampled copies are made if needed.
-        degraded: Indices of the views that are degraded for SfM.
-        attempt: The settings.
+    Photographs and degraded views are as for `register`.
     """
     result = []
     for i, photo in enumerate(photos.all):

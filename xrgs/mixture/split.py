@@ -63,11 +63,7 @@ class HrGeometry:
 
 
 def check_variant_conf(conf: VariantConf) -> None:
-    """Check the ranges of a variant's config.
-
-    Raises:
-        XrgsError: A value is out of range; the message names the key, the value and the range.
-    """
+    """Check a variant's config; XrgsError names a key that is out of its range, and the range."""
     rules = {
         "factor": (conf.factor >= 1, "1 or more"),
         "hr_fraction": (0 <= conf.hr_fraction <= 1, "0 to 1"),
@@ -108,15 +104,7 @@ def _one_of(value: str, *choices: str) -> tuple[bool, str]:
 
 
 def check_test_names(names: Sequence[str], conf: VariantConf) -> None:
-    """Refuse test views that the scene does not have.
-
-    Args:
-        names: The names of the scene's photographs.
-        conf: The variant's config.
-
-    Raises:
-        XrgsError: A name in `variant.test` is not among them; the message suggests a similar name.
-    """
+    """Refuse names in `variant.test` that the scene does not have, and suggest a similar name."""
     missing = [name for name in conf.test if name not in names]
     if not missing:
         return
@@ -193,16 +181,9 @@ def split_views(
 def split_before_sfm(
     names: Sequence[str], sizes: Sequence[tuple[int, int]], conf: VariantConf
 ) -> Split:
-    """Split the views before SfM.
+    """Split the views, of photographs of these sizes, px, before SfM; raises as `split_views` does.
 
-    Args:
-        names: The names of the views, sorted.
-        sizes: Width and height of each photograph, px.
-        conf: The variant's config. If tags depend on depth, all training views are HR until SfM is
-            done.
-
-    Raises:
-        XrgsError: As for `split_views`.
+    If tags depend on depth, all training views are HR until SfM is done.
     """
     if conf.tags not in POLICIES:
         return split_views(names, conf)
@@ -220,10 +201,7 @@ def split_by_score(names: Sequence[str], measures: Sequence[Measures], conf: Var
 def shortage(split: Split, registered: Set[int], conf: VariantConf) -> str:
     """Return a text if too few views are registered for training and test, else an empty text.
 
-    Args:
-        split: All views.
-        registered: Indices of the registered views.
-        conf: The variant's config. If it holds out no views, the training views are the test views.
+    If the config holds out no views, the training views are the test views.
     """
     hr, lr, tests = (registered & set(part) for part in (split.hr, split.lr, split.test))
     if not (conf.test or split.test):
@@ -277,26 +255,19 @@ def _select_by_score(train: Sequence[int], scores: Sequence[float], conf: Varian
 
 
 def shrink_factor(sizes: Sequence[tuple[int, int]], long_side: int) -> float:
-    """Return the common factor in (0, 1] for resizing all photographs of a scene.
+    """Return the common factor in (0, 1] for resizing all photographs, of these sizes in px.
 
-    With it the longest side of all photographs becomes `long_side`. It is 1 if `long_side` is 0 or
-    larger than all sides.
-
-    Args:
-        sizes: Width and height of each photograph, px.
-        long_side: `variant.long_side` or `variant.sfm.long_side`, px.
+    With it the longest side of all photographs becomes `long_side`, px. It is 1 if `long_side` is 0
+    or larger than all sides.
     """
     largest = max(max(size) for size in sizes)
     return min(long_side or largest, largest) / largest
 
 
 def hr_geometry(size: tuple[int, int], shrink: float, conf: VariantConf) -> HrGeometry:
-    """Compute the size of the HR view of a photograph, a multiple of `variant.factor`.
+    """Compute the size of the HR view of a photograph, px, a multiple of `variant.factor`.
 
-    Args:
-        size: Width and height of the photograph, px.
-        shrink: The result of `shrink_factor` for the scene.
-        conf: The variant's config.
+    `shrink` is the result of `shrink_factor` for the scene.
 
     Raises:
         TooSmallError: The LR view, `factor` times smaller, would be smaller than the SSIM window of

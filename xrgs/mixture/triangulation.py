@@ -26,19 +26,11 @@ def with_points(
     conf: SfmConf,
     work: Path,
 ) -> sfm.Reconstruction:
-    """Triangulate points for a model that has only cameras.
+    """Triangulate points for a model that has only cameras, of HR views.
 
-    As in SfM, LR views are degraded, and resized to the size of their HR views.
-
-    Args:
-        model: Cameras and poses of HR views.
-        photos: The photographs, with `hr` copies, and `lr` copies of the degraded views.
-        degraded: Indices of the degraded views.
-        conf: The settings of feature detection.
-        work: An existing folder for temporary files.
-
-    Raises:
-        XrgsError: Too few points are found.
+    As in SfM, LR views are degraded, and resized to the size of their HR views: `photos` needs `hr`
+    copies, and `lr` copies of the degraded views. `work` is an existing folder for temporary files.
+    XrgsError if too few points are found.
     """
     folder, order = work / "triangulation", sorted(model.viewmats)
     (folder / masks.MASKS).mkdir(parents=True)

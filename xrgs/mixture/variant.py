@@ -62,14 +62,9 @@ _CODE = CodeFolders(
 
 
 def key(scene: SceneConf, conf: VariantConf) -> str:
-    """Hash the photographs, poses, config and code of a variant, without running SfM.
+    """Hash the photographs, poses, config and code of a variant: 16 digits, without running SfM.
 
-    Returns:
-        16 hexadecimal digits.
-
-    Raises:
-        XrgsError: The photographs or the poses are missing, or the config is not usable; the
-            message says why.
+    XrgsError says why the photographs, the poses or the config are not usable.
     """
     split.check_variant_conf(conf)
     split.check_test_names(scenes.names(scene, conf.long_side) if conf.test else (), conf)
@@ -112,11 +107,8 @@ def all_code(scene: SceneConf, conf: VariantConf) -> dict[str, str]:
 def find(variants: Path, wanted_key: str) -> Variant | None:
     """Find and verify the frozen variant of a key; log and ignore corrupt variants.
 
-    Returns:
-        The variant; None if there is no intact one.
-
-    Raises:
-        UnreadableError: A variant can't be read at the moment; it may be intact.
+    None if there is no intact one; UnreadableError if one can't be read at the moment, since it may
+    be intact.
     """
     for folder in _of_key(variants, wanted_key):
         try:
@@ -132,15 +124,11 @@ def _of_key(variants: Path, wanted_key: str) -> list[Path]:
 
 
 def failure(variants: Path, wanted_key: str) -> str | None:
-    """Read why the last attempt to make the variant of a key failed.
+    """Read why the last attempt to make the variant of a key failed; None if it did not.
 
-    A key depends on photographs, config and code, so a change of any of these is tried again.
-
-    Returns:
-        The reason; None if there was no failure, or the report is damaged.
-
-    Raises:
-        UnreadableError: The report can't be read at the moment.
+    A key depends on photographs, config and code, so a change of any of these is tried again. A
+    damaged report counts as no failure; one that can't be read at the moment raises
+    UnreadableError.
     """
     folder = paths.failed_folder(variants, wanted_key)
     try:
@@ -154,11 +142,8 @@ def failure(variants: Path, wanted_key: str) -> str | None:
 def build(scene: SceneConf, conf: VariantConf, variants: Path, cache: Path) -> Variant:
     """Find the variant of a scene, or make it; several processes may call this concurrently.
 
-    Args:
-        scene: The scene's config.
-        conf: The variant's config.
-        variants: The store's folder of variants, created if missing; the store must exist.
-        cache: The store's folder of rendered scenes.
+    `variants` is the store's folder of variants, which is made if the store exists, and `cache` its
+    folder of rendered scenes.
 
     Raises:
         UnreadableError: The variant exists, but can't be read at the moment; it is not changed.

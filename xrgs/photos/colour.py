@@ -97,13 +97,8 @@ class Encoding:
 def from_h273(primaries: int, transfer: int, narrow_bits: int = 0) -> Encoding | None:
     """Return the colours that a HEIC file, a video or a PNG's cICP names by ITU-T H.273's numbers.
 
-    Args:
-        primaries: H.273's ColourPrimaries.
-        transfer: H.273's TransferCharacteristics.
-        narrow_bits: As in `Encoding`.
-
-    Returns:
-        None for full-range sRGB, or if the file says that its colours are unknown.
+    None for full-range sRGB, or if the file says that its colours are unknown. `narrow_bits` is as
+    in `Encoding`.
 
     Raises:
         ColourError: The curve is HDR, which has no white to scale by, or logarithmic; or a number

@@ -48,12 +48,7 @@ class Taken:
 
 
 def read(path: Path) -> Taken:
-    """Read the metadata of a photograph; damaged entries are skipped.
-
-    Raises:
-        UnreadableError: The file can't be read now.
-        ImageError: The file is not an image.
-    """
+    """Read the metadata of a photograph; damaged entries are skipped."""
     exif, details, xmp = images.metadata(path)
     values = [exif.get(_MAKE), exif.get(_MODEL), details.get(_FOCAL), details.get(_FOCAL_35MM)]
     camera = "/".join("" if v is None else str(v).strip("\0 ") for v in values).strip("/")

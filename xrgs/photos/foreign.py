@@ -46,11 +46,7 @@ def kind(file: Path) -> str:
 
 
 def check_file(file: Path) -> None:
-    """Refuse a file that can't be a transforms.json, by the end of its name.
-
-    Raises:
-        XrgsError: The message says what the file is, and what to do.
-    """
+    """Raise XrgsError for a file that can't be a transforms.json, by the end of its name."""
     for ending, (what, todo) in _ENDINGS.items():
         if file.name.lower().endswith(ending):
             raise XrgsError(

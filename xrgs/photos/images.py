@@ -5,6 +5,9 @@ the colours that they name. PNG, TIFF and HEIC keep all of their bits. HEIC need
 `heic`). Of a file with several images the first is read (the primary one of HEIC, and of the JPEGs
 that phones write with gain maps or depth). The images of a store are PNGs that `save` has written
 and `read_png` reads. Nothing here imports torch before `resize` is called.
+
+A function that reads a file raises `ImageError` if it is not such an image, and `UnreadableError`
+if it can't be read now.
 """
 
 from __future__ import annotations
@@ -16,7 +19,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, Protocol
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,9 +121,10 @@ def _stream(path: Path) -> Iterator[BinaryIO]:
     except (_RefusedError, colour.ColourError, tiff.DepthError) as error:
         raise ImageError(f"{path}: {error}") from error
     except UnidentifiedImageError as error:
-        raise ImageError(
-            f"{path}: unreadable or truncated image ({_unidentified(path)})"
-        ) from error
+        why = f"cannot identify it as one of {', '.join(_FORMATS)}"
+        if path.stat().st_size == 0:
+            why = "the file is empty"
+        raise ImageError(f"{path}: unreadable or truncated image ({why})") from error
     except Exception as error:  # PIL raises nearly anything on a damaged file
         # PIL's own OSErrors, of truncated files, have no number.
         if isinstance(error, OSError) and error.errno is not None and is_transient(error):
@@ -131,26 +135,13 @@ def _stream(path: Path) -> Iterator[BinaryIO]:
         raise ImageError(f"{path}: unreadable or truncated image ({why})") from error
 
 
-def _unidentified(path: Path) -> str:
-    """Say why PIL can't identify a file."""
-    if path.stat().st_size == 0:
-        return "the file is empty"
-    return f"cannot identify it as one of {', '.join(_FORMATS)}"
-
-
 def _check_size(
     stream: BinaryIO, size: tuple[int, int], max_pixels: int, bits: int, *, drawing: bool = True
 ) -> None:
     """Refuse an image that is too large, or that a file of so few bytes can't hold.
 
-    It is called before memory for the pixels is taken.
-
-    Args:
-        stream: The file.
-        size: Width and height, px.
-        max_pixels: The most pixels that it may have.
-        bits: Bits per pixel before compression.
-        drawing: Whether it may be a drawing: a small one compresses without limit.
+    It is called before memory for the pixels is taken. `size` is in px, and `bits` are those of a
+    pixel before compression. A small drawing compresses without limit.
     """
     width, height = size
     if width * height > max_pixels:
@@ -188,11 +179,7 @@ def _formats(start: bytes, suffix: str) -> tuple[str, ...]:
 def is_photograph(path: Path) -> bool | None:
     """Return whether a file without an image's suffix is a photograph, by its first bytes.
 
-    Returns:
-        None where it may be an image of a format that is not read.
-
-    Raises:
-        OSError: The file can't be read.
+    None where it may be an image of a format that is not read; OSError if it can't be read.
     """
     with path.open("rb") as stream:
         start = stream.read(16)
@@ -237,44 +224,6 @@ class Picture:
     """What was converted or ignored, such as `converted from Display P3 to sRGB`."""
 
 
-@dataclass
-class _Samples:
-    """The decoded pixels of a file, before they are converted to sRGB and turned upright."""
-
-    colours: NDArray[np.uint8] | NDArray[np.uint16]
-    """[H, W, 1, 3 or 4]: grey, RGB or CMYK."""
-    alpha: NDArray[np.float32] | None
-    note: str = ""
-    is_upright: bool = False
-
-
-class _File(Protocol):
-    """An opened photograph."""
-
-    size: tuple[int, int]
-    """Width and height of the pixels as they are stored, px."""
-    orientation: int
-    channels: int
-    bits: int
-    exif: Image.Exif
-    profile: bytes | None
-    note: str
-
-    @property
-    def xmp(self) -> str:
-        """Return the XMP of the file; empty if it has none."""
-
-    @property
-    def frames(self) -> int:
-        """Return the number of images in the file, without a JPEG's gain maps and depth."""
-
-    def encoding(self) -> colour.Encoding | None:
-        """Return the colours that a file without an ICC profile names."""
-
-    def load(self) -> _Samples:
-        """Decode the pixels."""
-
-
 class _PilFile:
     """A photograph that PIL opens; `tiff` decodes the PNGs and HEIC files of more than 8 bits."""
 
@@ -310,16 +259,19 @@ class _PilFile:
 
     @property
     def xmp(self) -> str:
+        """The XMP of the file; empty if it has none."""
         found = self.image.info.get("xmp") or self.image.info.get("XML:com.adobe.xmp") or b""
         return found if isinstance(found, str) else found.decode("utf-8", errors="replace")
 
     @property
     def frames(self) -> int:
+        """The number of images in the file."""
         # Further images of a JPEG are gain maps, depth, or the other half of a stereo pair.
         is_jpeg = self.image.format in ("JPEG", "MPO")
         return 1 if is_jpeg else getattr(self.image, "n_frames", 1)
 
     def encoding(self) -> colour.Encoding | None:
+        """Return the colours that a file without an ICC profile names."""
         info = self.image.info
         cicp = self._chunks.get(b"cICP", b"")
         if len(cicp) == 4:
@@ -327,9 +279,8 @@ class _PilFile:
                 raise colour.ColourError("its cICP names a matrix, which a PNG's colours have not")
             return colour.from_h273(cicp[0], cicp[1], 0 if cicp[3] else self.bits)
         if self._chunks:
-            known = "srgb" in info
             xy = info.get("chromaticity")
-            return None if known else colour.from_png(info.get("gamma"), xy)
+            return None if "srgb" in info else colour.from_png(info.get("gamma"), xy)
         if nclx := info.get("nclx_profile"):
             if not int(nclx["matrix_coefficients"]) and not int(nclx["full_range_flag"]):
                 raise colour.ColourError("RGB values of narrow range are not read; save it as PNG")
@@ -350,37 +301,36 @@ class _PilFile:
                 return colour.adobe_rgb()
         return None
 
-    def load(self) -> _Samples:
+    def load(self) -> tiff.Samples:
+        """Decode the pixels."""
         image: Image.Image = self.image
         if self.bits > 8:
             self._stream.seek(0)
             if image.format == "HEIF":
-                found = tiff.decode_heif(self._stream)
-            elif image.format != "PNG":
-                found = tiff.of_grey(np.asarray(image))
-            else:
-                significant = max(self._chunks.get(b"sBIT", b"\x10"))
-                found = tiff.decode_png(self._stream.read(), significant)
-            upright = image.format == "HEIF"
-            return _Samples(found.colours, found.alpha, found.note, upright)
+                return tiff.decode_heif(self._stream)
+            if image.format != "PNG":
+                return tiff.of_grey(np.asarray(image))
+            significant = max(self._chunks.get(b"sBIT", b"\x10"))
+            return tiff.decode_png(self._stream.read(), significant)
         image.load()
         upright = image.format in ("HEIF", "TIFF")
         if image.mode == "LAB":
             self.profile = None  # it describes LAB, which `from_lab` converts
-            return _Samples(colour.from_lab(image), None, "converted from CIELAB to sRGB", upright)
+            note = "converted from CIELAB to sRGB"
+            return tiff.Samples(colour.from_lab(image), None, note, upright)
         if image.has_transparency_data:
             # PIL converts premultiplied colours (La, RGBa) and palettes with alpha.
             with_alpha = image.convert("LA" if image.mode in ("1", "L", "LA", "La") else "RGBA")
             samples = np.asarray(with_alpha)
             alpha = samples[..., -1].astype(np.float32) / np.float32(255)
-            return _Samples(samples[..., :-1], alpha, is_upright=upright)
+            return tiff.Samples(samples[..., :-1], alpha, is_upright=upright)
         if image.mode not in ("L", "RGB", "CMYK"):
             image = image.convert("L" if image.mode == "1" else "RGB")
-        return _Samples(np.atleast_3d(np.asarray(image)), None, is_upright=upright)
+        return tiff.Samples(np.atleast_3d(np.asarray(image)), None, is_upright=upright)
 
 
 class _DeepTiff:
-    """A TIFF of more than 8 bits per channel."""
+    """A TIFF of more than 8 bits per channel; `_PilFile` says what its members are."""
 
     def __init__(self, stream: BinaryIO, read: tiff.Tiff) -> None:
         self._tiff = read
@@ -407,12 +357,11 @@ class _DeepTiff:
     def encoding(self) -> colour.Encoding | None:
         return None
 
-    def load(self) -> _Samples:
-        found = self._tiff.decode()
-        return _Samples(found.colours, found.alpha, found.note)
+    def load(self) -> tiff.Samples:
+        return self._tiff.decode()
 
 
-def _file(stream: BinaryIO, path: Path) -> _File:
+def _file(stream: BinaryIO, path: Path) -> _PilFile | _DeepTiff:
     start = stream.read(16)
     stream.seek(0)
     if start[:4] not in _TIFF_MAGIC:
@@ -472,54 +421,34 @@ def turned_size(size: tuple[int, int], orientation: int) -> tuple[int, int]:
 
 
 def header(path: Path) -> Header:
-    """Read the header of a photograph; `decode` gives pixels of its size.
-
-    Raises:
-        UnreadableError: The file can't be read now.
-        ImageError: The file is not an image, or is larger than `MAX_PIXELS`.
-    """
+    """Read the header of a photograph of at most `MAX_PIXELS`."""
     with _stream(path) as stream:
         return _header(_file(stream, path))
 
 
-def _header(file: _File) -> Header:
+def _header(file: _PilFile | _DeepTiff) -> Header:
     size = turned_size(file.size, file.orientation)
     return Header(size, file.orientation, file.channels, file.bits)
 
 
 def size(path: Path) -> tuple[int, int]:
-    """Return the upright width and height of a photograph, px; raises as `header` does."""
+    """Return the upright width and height of a photograph, px."""
     return header(path).size
 
 
 def is_own(path: Path) -> bool:
-    """Return whether a file is a PNG that this package wrote: a render, a film's frame, a figure.
-
-    Raises:
-        UnreadableError: The file can't be read now.
-        ImageError: The file is not a PNG.
-    """
+    """Return whether a PNG is one that this package wrote: a render, a film's frame, a figure."""
     with _stream(path) as stream, Image.open(stream, formats=("PNG",)) as image:
         return image.info.get("Software") == SOFTWARE
 
 
 def has_colour(path: Path) -> bool:
-    """Return whether a file's pixels have three channels or more; masks and depth maps have one.
-
-    Raises:
-        UnreadableError: The file can't be read now.
-        ImageError: The file is not an image.
-    """
+    """Return whether a file's pixels have three channels or more; masks and depth maps have one."""
     return header(path).channels >= 3
 
 
 def thumbnail(path: Path, side: int) -> NDArray[np.uint8]:
-    """Read a small grey picture of a photograph, [side, side], upright by its EXIF orientation.
-
-    Raises:
-        UnreadableError: The file can't be read now.
-        ImageError: The file is unreadable or truncated.
-    """
+    """Read a small grey picture of a photograph, [side, side], upright by its EXIF orientation."""
     with _stream(path) as stream:
         file = _file(stream, path)
         if isinstance(file, _PilFile) and file.bits <= 8:
@@ -540,12 +469,7 @@ def _small(image: Image.Image, side: int) -> NDArray[np.uint8]:
 
 
 def metadata(path: Path) -> tuple[Image.Exif, dict[int, Any], str]:
-    """Read a photograph's EXIF, its sub-directory on the exposure, and XMP; empty if absent.
-
-    Raises:
-        UnreadableError: The file can't be read now.
-        ImageError: The file is not an image.
-    """
+    """Read a photograph's EXIF, its sub-directory on the exposure, and XMP; empty if absent."""
     with _stream(path) as stream:
         file, details = _file(stream, path), {}
         with suppress(Exception):  # PIL raises nearly anything on damaged EXIF
@@ -556,10 +480,8 @@ def metadata(path: Path) -> tuple[Image.Exif, dict[int, Any], str]:
 def decode(path: Path) -> Picture:
     """Decode a photograph: upright, in sRGB 0..1 (8-bit values / 255), with separate alpha.
 
-    Raises:
-        UnreadableError: The file can't be read now.
-        ImageError: The file is unreadable, truncated, larger than `MAX_PIXELS`, or its values have
-            no known white.
+    `ImageError` also says that it is larger than `MAX_PIXELS`, or that its values have no known
+    white.
     """
     with _stream(path) as stream:
         file = _file(stream, path)
@@ -593,12 +515,7 @@ def composite(
 
 
 def read(path: Path, background: Sequence[float] = (0, 0, 0)) -> ImageArray:
-    """Decode a photograph, and lay it over a background where it is transparent: [H, W, 3].
-
-    Raises:
-        UnreadableError: The file can't be read now.
-        ImageError: As for `decode`.
-    """
+    """Decode a photograph, and lay it over a background where it is transparent: [H, W, 3]."""
     picture = decode(path)
     if picture.alpha is None:
         return picture.pixels
@@ -612,28 +529,15 @@ def read_png(
 ) -> ImageArray:
     """Read an image of a store, a PNG as `save` writes it: [H, W, 3], its 8-bit values / 255.
 
-    Args:
-        path: The file.
-        size: The width and height that it must have, px; None admits any.
-        max_pixels: The most pixels that it may have.
-
-    Raises:
-        UnreadableError: The file can't be read now.
-        ImageError: The file is not such a PNG.
+    `size` is the width and height that it must have, px; None admits any.
     """
-    return _to_array(read_png_pil(path, size, max_pixels))
+    return np.asarray(read_png_pil(path, size, max_pixels), np.float32) / np.float32(255)
 
 
 def read_mask(path: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
     """Read a mask of a store, a PNG as `save_mask` writes it: [H, W], True for a used pixel.
 
-    Args:
-        path: The file.
-        size: The width and height that it must have, px.
-
-    Raises:
-        UnreadableError: The file can't be read now.
-        ImageError: The file is not such a PNG.
+    `size` is the width and height that it must have, px.
     """
     mask: NDArray[np.bool_] = np.asarray(read_png_pil(path, size, mode="L")) > 127
     return mask
@@ -659,18 +563,11 @@ def read_png_pil(
         return image
 
 
-def _to_array(image: Image.Image) -> ImageArray:
-    array: ImageArray = np.asarray(image, dtype=np.float32) / np.float32(255)
-    return array
-
-
 def save(path: Path, image: ImageArray, *, durable: bool = True) -> None:
-    """Write an 8-bit RGB PNG, clamped to 0..1 and rounded to nearest.
+    """Write an 8-bit RGB PNG of an image [H, W, 3], clamped to 0..1 and rounded to nearest.
 
-    Args:
-        path: The file, which is replaced atomically; its folder is made, but no parents of it.
-        image: [H, W, 3].
-        durable: As for `atomic_writer`.
+    The file is replaced atomically; its folder is made, but no parents of it. `durable` is as for
+    `atomic_writer`.
     """
     path.parent.mkdir(exist_ok=True)  # not parents: a store that vanished stays away
     with atomic_writer(path, durable=durable) as stream:
@@ -702,7 +599,7 @@ def through_jpeg(image: ImageArray, quality: int) -> ImageArray:
     encoded = Image.fromarray(to_8_bit(image))
     encoded.save(stream, "JPEG", quality=quality, subsampling="4:2:0")
     with Image.open(stream) as decoded:
-        return _to_array(decoded)
+        return np.asarray(decoded, np.float32) / np.float32(255)
 
 
 def block_means(image: NDArray[np.floating[Any]], side: int) -> ImageArray:

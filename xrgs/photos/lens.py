@@ -115,13 +115,10 @@ class Lens:
         return self._moved(R, shift, (width, height))
 
     def undistorted(self) -> Lens:
-        """Return the pinhole camera of the undistorted image.
+        """Return the pinhole camera of the undistorted image; XrgsError if there is none.
 
         It has the same size and principal point, and the smallest focal length with which every
         pixel has a source inside the photograph and no side is more than 60 degrees from the axis.
-
-        Raises:
-            XrgsError: There is no such camera.
         """
         if self.is_pinhole:
             return self
@@ -139,10 +136,7 @@ class Lens:
         return float(enclosed / (self.width * self.height))
 
     def project(self, rays: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Project rays to pixels by pycolmap.
-
-        Args:
-            rays: Points [N, 2] on the plane z = 1, in the axes of the image.
+        """Project rays, points [N, 2] on the plane z = 1 in the axes of the image, by pycolmap.
 
         Returns:
             Pixels [N, 2] of the image; NaN for a ray that the camera model can't project.
@@ -173,12 +167,7 @@ class Lens:
 
 
 def lens_of_model(model: str, size: tuple[int, int], params: Sequence[float]) -> Lens:
-    """Make the lens of COLMAP's camera; a model whose distortion is 0 becomes PINHOLE.
-
-    Args:
-        model: The name of COLMAP's camera model.
-        size: Width and height of its images, px.
-        params: The model's parameters, in COLMAP's order.
+    """Make the lens of COLMAP's camera for images of a size, px; without distortion it is PINHOLE.
 
     Raises:
         XrgsError: The model is not supported, or a value is out of its range.
@@ -220,18 +209,10 @@ def quarter_turn(quarters: int) -> NDArray[np.float64]:
 
 
 def undistort(image: ImageArray, lens: Lens, order: int = 3) -> ImageArray:
-    """Resample a photograph to the image of `lens.undistorted()`, by spline interpolation.
+    """Resample a photograph [H, W, C] to the image of `lens.undistorted()` by splines.
 
-    Args:
-        image: The photograph, [H, W, C] in 0..1.
-        lens: Its camera, of the same size.
-        order: The order of the spline: 3 for photographs, 1 for masks.
-
-    Returns:
-        The undistorted image [H, W, C], not clamped; the image itself where the lens is a pinhole.
-
-    Raises:
-        ValueError: The image and the lens differ in size.
+    The order of the spline is 3 for photographs, and 1 for masks. The result is not clamped; it is
+    the image itself where the lens is a pinhole. Image and lens must be of one size.
     """
     if image.shape[:2] != (lens.height, lens.width):
         raise ValueError(f"image {image.shape[:2]}, lens {(lens.height, lens.width)}")

@@ -64,7 +64,6 @@ def find(folder: str, photographs: Mapping[str, Path]) -> tuple[dict[str, Path],
         on masks without a photograph.
 
     Raises:
-        UnreadableError: The folder can't be read now.
         XrgsError: The folder is missing, none of its images is the mask of a photograph, or two are
             masks of one.
     """
@@ -150,9 +149,7 @@ class Masks:
             headers: The headers of the photographs.
 
         Raises:
-            UnreadableError: A mask can't be read now.
-            ImageError: A mask is no image.
-            XrgsError: A mask has another shape than its photograph.
+            XrgsError: A mask has another shape than its photograph, or is no image.
         """
         files = {name: file for name, file in files.items() if name in headers}
         stored, seen, either = set[str](), set[str](), set[str]()
@@ -185,15 +182,9 @@ class Masks:
         return cls(files, frozenset(stored), tuple(notes))
 
     def read(self, name: str, photograph: Header) -> tuple[Mask | None, str]:
-        """Read the mask of a photograph.
+        """Read the mask [H, W] of a photograph, at its size; None if there is none.
 
-        Returns:
-            The mask [H, W] at the photograph's size, None if there is none; and a note, empty for a
-            black and white mask.
-
-        Raises:
-            UnreadableError: The mask can't be read now.
-            ImageError: The mask can't be decoded.
+        The note is empty for a black and white mask.
         """
         if name not in self.files:
             return None, ""
@@ -262,16 +253,10 @@ def undistorted(mask: Mask, lens: Lens) -> Mask:
 
 
 def filled(image: NDArray[_T], mask: Mask | None) -> NDArray[_T]:
-    """Give each pixel that is not used the colour of the nearest used one.
+    """Give each pixel of an image [H, W, 3] that is not used the colour of the nearest used one.
 
-    Hidden content then reaches no used pixel by resampling, and no window of SSIM.
-
-    Args:
-        image: [H, W, 3].
-        mask: [H, W]; None uses all pixels.
-
-    Returns:
-        [H, W, 3]; the image itself if all or none of its pixels are used.
+    Hidden content then reaches no used pixel by resampling, and no window of SSIM. The result is
+    the image itself if all or none of its pixels are used.
     """
     if mask is None or not mask.any():
         return image

@@ -34,53 +34,60 @@ class DepthError(ValueError):
 
 
 @dataclass(frozen=True)
-class DeepPixels:
-    """The pixels of an image, as they are stored."""
+class Samples:
+    """The decoded pixels of a file, before they are converted to sRGB and turned upright."""
 
-    colours: NDArray[np.uint16]
-    """[H, W, 1, 3 or 4]: grey, RGB or CMYK, white (or full ink) is 65535."""
+    colours: NDArray[np.uint8] | NDArray[np.uint16]
+    """[H, W, 1, 3 or 4]: grey, RGB or CMYK; white (or full ink) is the largest value."""
     alpha: NDArray[np.float32] | None
     """[H, W] in 0..1."""
     note: str = ""
+    is_upright: bool = False
 
 
-def decode_png(content: bytes, significant: int) -> DeepPixels:
+def decode_png(content: bytes, significant: int) -> Samples:
     """Decode a 16-bit PNG; `significant` is the largest number of bits in its sBIT, else 16."""
     import imagecodecs
 
     samples: NDArray[np.uint16] = imagecodecs.png_decode(content)
-    samples = np.atleast_3d(samples)
-    count = samples.shape[2]
-    has_alpha = count in (2, 4)
-    colours = samples[..., : count - has_alpha]
-    alpha = _share(samples[..., -1], _WHITE) if has_alpha else None
+    colours, alpha = _without_alpha(samples, _WHITE)
     scaled, note = _scaled(colours, _WHITE, (1 << significant) - 1)
-    return DeepPixels(scaled, alpha, note)
+    return Samples(scaled, alpha, note)
 
 
-def of_grey(samples: NDArray[Any]) -> DeepPixels:
+def of_grey(samples: NDArray[Any]) -> Samples:
     """Convert 16-bit grey samples [H, W] that Pillow has decoded."""
-    return DeepPixels(_scaled(samples[..., None], _WHITE, _WHITE)[0], None)
+    return Samples(_scaled(samples[..., None], _WHITE, _WHITE)[0], None)
 
 
-def decode_heif(stream: BinaryIO) -> DeepPixels:
+def decode_heif(stream: BinaryIO) -> Samples:
     """Decode the primary image of a HEIC file of 10 or 12 bits, upright."""
     import pillow_heif
 
     image = pillow_heif.open_heif(stream, convert_hdr_to_8bit=False, hdr_to_16bit=False)
-    samples = np.atleast_3d(np.asarray(image))
     white = (1 << int(image.info["bit_depth"])) - 1
-    count = samples.shape[2]
-    has_alpha = count in (2, 4)
-    colours = samples[..., : count - has_alpha]
-    alpha = _share(samples[..., -1], white) if has_alpha else None
+    colours, alpha = _without_alpha(np.asarray(image), white)
     if alpha is not None and image.premultiplied_alpha:
         colours = _unmultiplied(colours, alpha, white)
-    return DeepPixels(_scaled(colours, white, white)[0], alpha)
+    return Samples(_scaled(colours, white, white)[0], alpha, is_upright=True)
+
+
+def _without_alpha(
+    samples: NDArray[Any], white: int
+) -> tuple[NDArray[Any], NDArray[np.float32] | None]:
+    """Separate samples [H, W] or [H, W, 1 to 4] into colours [H, W, 1 or 3], and alpha [H, W]."""
+    samples = np.atleast_3d(samples)
+    if samples.shape[2] in (1, 3):
+        return samples, None
+    return samples[..., :-1], _share(samples[..., -1], white)
 
 
 class Tiff:
-    """The first page of a TIFF."""
+    """The first page of a TIFF.
+
+    `bits` per sample; `size` is width and height as stored, before EXIF's turn, px; `channels` is
+    the number of samples per pixel.
+    """
 
     def __init__(self, stream: BinaryIO) -> None:
         """Read its tags; the stream must stay open."""
@@ -91,6 +98,10 @@ class Tiff:
         self._pages = tifffile.TiffFile(stream).pages
         self._page: tifffile.TiffPage = self._pages.first
         self._stream = stream
+        self.bits, self.channels = int(self._page.bitspersample), int(self._page.samplesperpixel)
+        self.size = self._page.imagewidth, self._page.imagelength
+        # Of the first channel after the colours; None if the file doesn't say.
+        self._extra = next((int(kind) for kind in self._page.extrasamples), None)
 
     @property
     def is_deep(self) -> bool:
@@ -100,28 +111,8 @@ class Tiff:
     @property
     def note(self) -> str:
         """A note if a fourth channel, perhaps alpha, is ignored; else empty."""
-        ignored = self.extra == _UNSPECIFIED
+        ignored = self._extra == _UNSPECIFIED
         return "a channel ignored, which the file does not call alpha" if ignored else ""
-
-    @property
-    def bits(self) -> int:
-        """Bits per sample."""
-        return int(self._page.bitspersample)
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height as stored, before EXIF's turn, px."""
-        return self._page.imagewidth, self._page.imagelength
-
-    @property
-    def channels(self) -> int:
-        """Samples per pixel."""
-        return int(self._page.samplesperpixel)
-
-    @property
-    def extra(self) -> int | None:
-        """ExtraSamples of the first channel after the colours; None if the file doesn't say."""
-        return next((int(kind) for kind in self._page.extrasamples), None)
 
     @property
     def frames(self) -> int:
@@ -132,7 +123,7 @@ class Tiff:
         """Return the value of a tag."""
         return self._page.tags.valueof(tag, default=default)
 
-    def decode(self) -> DeepPixels:
+    def decode(self) -> Samples:
         """Decode the pixels as stored, before EXIF's turn.
 
         Raises:
@@ -158,13 +149,13 @@ class Tiff:
         samples = np.atleast_3d(samples)
         white, count = (1 << bits) - 1, _COLOURS[photometric]
         colours, alpha = samples[..., :count], None
-        if samples.shape[2] > count and self.extra != _UNSPECIFIED:
+        if samples.shape[2] > count and self._extra != _UNSPECIFIED:
             alpha = _share(samples[..., count], white)
-            if self.extra == _ASSOCIATED:
+            if self._extra == _ASSOCIATED:
                 colours = _unmultiplied(colours, alpha, white)
         largest = int(np.max(self.value(_MAX_SAMPLE_VALUE, white)))
         scaled, note = _scaled(colours, white, largest)
-        return DeepPixels(_WHITE - scaled if photometric == _MIN_IS_WHITE else scaled, alpha, note)
+        return Samples(_WHITE - scaled if photometric == _MIN_IS_WHITE else scaled, alpha, note)
 
 
 def _share(values: NDArray[Any], white: int) -> NDArray[np.float32]:

@@ -127,11 +127,7 @@ class Lease:
 
 
 def acquire(folder: Path, name: str) -> Lease | None:
-    """Take a lease; return None if its owner is alive.
-
-    Raises:
-        OSError: The folder of the leases can't be read or written.
-    """
+    """Take a lease; return None if its owner is alive."""
     while True:
         files = _generations(folder, name)
         if any(_state(file) is _State.ALIVE for file in files.values()):
@@ -159,11 +155,7 @@ def acquire(folder: Path, name: str) -> Lease | None:
 
 @contextmanager
 def waited_for(folder: Path, name: str) -> Iterator[Lease]:
-    """Hold a lease during a block, after waiting until its owner has released it or is dead.
-
-    Raises:
-        OSError: The folder of the leases can't be read or written.
-    """
+    """Hold a lease during a block, after waiting until its owner has released it or is dead."""
     warned = False
     while (lease := acquire(folder, name)) is None:
         if not warned:
@@ -182,12 +174,9 @@ def names(folder: Path) -> set[str]:
 
 
 def holders(folder: Path) -> dict[str, str]:
-    """Describe the owner of each lease in a folder, without dead owners.
+    """Describe for people the owner of each lease in a folder, without dead owners, by its name.
 
     The folder need not exist.
-
-    Returns:
-        Descriptions for people, by the name of the lease.
     """
     return {
         _parts(file)[0]: str(signature(file) or "a process that has not signed its lease yet")
@@ -199,10 +188,10 @@ def holders(folder: Path) -> dict[str, str]:
 def sign(path: Path) -> Owner:
     """Create a file that names this process as its owner, and return the signature.
 
-    Raises:
-        FileExistsError: The file exists.
+    FileExistsError if it exists.
     """
-    owner = _self()
+    pid = os.getpid()  # not cached: a process may be forked
+    owner = Owner(socket.gethostname(), processes.boot(), pid, processes.started(pid))
     with path.open("xb") as stream:
         try:
             stream.write(json.dumps(msgspec.structs.asdict(owner)).encode())
@@ -273,9 +262,3 @@ def _now(folder: Path) -> float:
     except OSError:
         return time.time()
     return now
-
-
-def _self() -> Owner:
-    """Return this process as an owner. It is not cached, because a process may be forked."""
-    pid = os.getpid()
-    return Owner(socket.gethostname(), processes.boot(), pid, processes.started(pid))

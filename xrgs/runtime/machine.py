@@ -28,11 +28,7 @@ def usable_cores() -> int:
 
 
 def cpu_quota(root: Path = Path("/")) -> float:
-    """Return the CPU quota of this process's control groups, in cores; infinite without one.
-
-    Args:
-        root: The root of the file system.
-    """
+    """Return the CPU quota of this process's control groups, in cores; infinite without one."""
     quotas = [math.inf]
     for folder in _control_groups(root, "cpu"):
         # Version 2 writes `max` for no quota, version 1 writes -1.
@@ -48,9 +44,6 @@ def usable_memory(root: Path = Path("/")) -> int:
     """Return the memory that this process may use at most, in bytes.
 
     It is the least of the machine's memory and the memory limits of the process's control groups.
-
-    Args:
-        root: The root of the file system.
     """
     limits = [int(psutil.virtual_memory().total)]
     for folder in _control_groups(root, "memory"):
@@ -102,11 +95,8 @@ def set_portable_blas(cpuinfo: Path = Path("/proc/cpuinfo")) -> None:
     """Make OpenBLAS in child processes (numpy's, pycolmap's) use AVX2 where the processor has it.
 
     OpenBLAS has other kernels for processors with AVX-512, whose last digits differ. A value of
-    OPENBLAS_CORETYPE that is already in the environment is kept.
-
-    Args:
-        cpuinfo: The file in which Linux lists the features of processors. On systems without it
-            nothing is set.
+    OPENBLAS_CORETYPE that is already in the environment is kept. On systems other than Linux
+    nothing is set.
     """
     if {"avx2", "fma"} <= set(_words(cpuinfo)):
         os.environ.setdefault("OPENBLAS_CORETYPE", "Haswell")

@@ -25,11 +25,7 @@ def boot() -> str:
 
 
 def started(pid: int) -> float:
-    """Return when a process started, in seconds after the boot.
-
-    Raises:
-        psutil.NoSuchProcess: There is no such process.
-    """
+    """Return when a process started, in seconds after the boot."""
     # Not in seconds since the epoch: these change for a running process when the clock is set.
     return round(float(psutil.Process(pid).create_time() - psutil.boot_time()), 2)
 
@@ -47,10 +43,9 @@ def lives(pid: int, start: float) -> bool:
 
 
 def resident_bytes(session: int) -> int:
-    """Return the resident bytes of all processes of a session; shared pages count for each.
+    """Return the resident bytes of all processes of a session, by the id of its first process.
 
-    Args:
-        session: The id of the session, which is the id of the process that leads it.
+    Shared pages count for each.
     """
     total: int = 0
     for pid in psutil.pids():

@@ -147,7 +147,8 @@ class ProgressBar(_Tqdm):
             if self._file is None:
                 log_line(str(state))
             else:
-                _write(self._file.path, state)
+                with suppress(OSError):  # nothing is lost: progress is not a result
+                    write_json(self._file.path, msgspec.structs.asdict(state), durable=False)
         return None
 
     def _rate(self) -> float | None:
@@ -165,18 +166,11 @@ def progress(
     return iter(ProgressBar(what, unit, total, items=items, done=done))
 
 
-def _write(file: Path, state: Progress) -> None:
-    # Progress is not a result: nothing is lost when it can't be written.
-    with suppress(OSError):
-        write_json(file, msgspec.structs.asdict(state), durable=False)
-
-
 @contextmanager
 def written_to(file: Path) -> Iterator[ProgressFile]:
     """Keep the latest state of the latest bar of a block in a file, and show no bar.
 
-    Yields:
-        The file, with a note that can be set. It is removed at the end.
+    The file that is yielded has a note that can be set. It is removed at the end.
     """
     target = ProgressFile(file)
     token = _file.set(target)

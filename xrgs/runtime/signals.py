@@ -29,13 +29,8 @@ def exit_on_signal(hint: str) -> Iterator[None]:
 
     The first signal raises an exception in the block, so that its `finally` clauses run; the second
     one ends the process at once. A signal that the process ignored from its start (`nohup`, a
-    shell's `&`) stays ignored.
-
-    Args:
-        hint: A text that is printed after the name of the signal: what is kept, and how to go on.
-
-    Raises:
-        SystemExit: A signal arrived; the exit code is 128 plus its number, as shells report it.
+    shell's `&`) stays ignored. `hint` is printed after the name of the signal: what is kept, and
+    how to go on. The exit code is 128 plus its number, as shells report it.
     """
     for number in (signal.SIGINT, signal.SIGTERM):
         if signal.getsignal(number) is not signal.SIG_IGN:

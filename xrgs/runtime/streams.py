@@ -23,14 +23,10 @@ if TYPE_CHECKING:
 
 
 def say(text: str, stream: TextIO | None = None) -> None:
-    """Print a text; on a terminal it replaces a bar on the current line.
+    """Print a text, on stdout by default; on a terminal it replaces a bar on the current line.
 
     The terminal obeys no code in the text. A character that the stream's encoding lacks is written
-    as its number.
-
-    Args:
-        text: The text. In a text of several lines, names must have gone through `for_line`.
-        stream: Where to print it; None for stdout.
+    as its number. In a text of several lines, names must have gone through `for_line`.
     """
     stream = sys.stdout if stream is None else stream
     encoding = stream.encoding or "utf-8"  # a stream in memory has none
@@ -40,16 +36,11 @@ def say(text: str, stream: TextIO | None = None) -> None:
 
 
 def redraw(text: str, above: int, terminal: TextIO) -> int:
-    """Print a text on a terminal over the last lines that this function printed.
+    """Print a text on a terminal over the last lines that this function printed; return its lines.
 
-    Args:
-        text: The text. Names in it must have gone through `for_line`. A line is cut at the
-            terminal's width, and lines that do not fit below one another are left out.
-        above: The number of lines to print over, as the last call returned it; 0 at first.
-        terminal: Where to print it.
-
-    Returns:
-        The number of lines of the text.
+    Names in it must have gone through `for_line`. A line is cut at the terminal's width, and lines
+    that do not fit below one another are left out. `above` is the number of lines to print over, as
+    the last call returned it; 0 at first.
     """
     width, height = shutil.get_terminal_size()
     lines = [line[: width - 1] for line in text.split("\n")][: height - 1]
@@ -112,14 +103,7 @@ def guard_streams() -> None:
         # A stream that other code has put in the place of Python's own stays.
         if stream is getattr(sys, f"__{name}__"):
             encoding = "utf-8" if stream is None else stream.encoding
-            setattr(sys, name, _without_write_errors(descriptor, encoding))
-
-
-def _without_write_errors(descriptor: int, encoding: str) -> TextIO:
-    raw = _WriteErrorsIgnored(descriptor, "w", closefd=False)
-    return io.TextIOWrapper(
-        io.BufferedWriter(raw),
-        encoding=encoding,
-        errors="backslashreplace",  # help and bars have characters that ASCII lacks
-        line_buffering=True,
-    )
+            raw = io.BufferedWriter(_WriteErrorsIgnored(descriptor, "w", closefd=False))
+            # Help and bars have characters that ASCII lacks.
+            text = io.TextIOWrapper(raw, encoding, "backslashreplace", line_buffering=True)
+            setattr(sys, name, text)

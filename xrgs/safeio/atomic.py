@@ -19,18 +19,9 @@ if TYPE_CHECKING:
 def atomic_writer(path: Path, *, durable: bool = True) -> Iterator[IO[bytes]]:
     """Open a binary stream whose content replaces a file when the block ends without an exception.
 
-    The content is written to a temporary file in the same folder, which is renamed at the end.
-
-    Args:
-        path: The file to replace or create; its folder must exist.
-        durable: Whether to wait until the content and the name are on the disk. Without it, the
-            new content can be lost in a power failure.
-
-    Yields:
-        The stream to write to.
-
-    Raises:
-        OSError: The file can't be written. The old file is then as it was.
+    The content is written to a temporary file in the same folder, which must exist, and is renamed
+    at the end. If that fails with an OSError, the old file is as it was. A `durable` file is waited
+    for until content and name are on the disk; else the new content can be lost in a power failure.
     """
     # Not mkstemp: only the owner could read its files, and a store is shared by a team.
     temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}")

@@ -22,12 +22,8 @@ def hashes(folder: Path, names: Iterable[str]) -> dict[str, str]:
 def changed(folder: Path, files: Mapping[str, str]) -> Iterator[StoreError]:
     """Yield an error for each file of a folder that is missing or has changed.
 
-    Args:
-        folder: The folder.
-        files: The SHA-256 that each file must have, by its path in the folder, with `/`.
-
-    Yields:
-        The errors; an `UnreadableError` for a file that can't be read now.
+    `files` has the SHA-256 that each must have, by its path in the folder, with `/`. The error is
+    an `UnreadableError` for a file that can't be read now.
     """
     for name, expected in files.items():
         file = folder / name

@@ -62,7 +62,8 @@ class CodeFolders:
     def core(self) -> tuple[str, ...]:
         """Return the files that count always, sorted."""
         outside = (*self.whole_parts, *self.folders_of_parts)
-        files = {name for name in _names(*self.folders) if not _is_in(name, outside)}
+        names = {file.relative_to(PACKAGE).as_posix() for file in sources(*self.folders)}
+        files = {name for name in names if not _is_in(name, outside)}
         files |= {f"{folder}/__init__.py" for folder in self.folders_of_parts}
         return tuple(sorted(self._with_imports(files, self.parts) - self.registries))
 
@@ -72,11 +73,7 @@ class CodeFolders:
         return tuple(sorted(self._with_imports({file}, others)))
 
     def needed_by(self, files: Iterable[Path]) -> dict[str, Path]:
-        """Return the parts that source files import, and the files that these need, by name.
-
-        Args:
-            files: Files that need not be of this package.
-        """
+        """Return the parts that files of any package import, and what these need, by name."""
         core = {*self.core()}
         imported = {name for file in files for name in _imported(file)} - core
         parts = {name for name in imported if _is_in(name, self.folders_of_parts)}
@@ -92,10 +89,6 @@ class CodeFolders:
             pending += imported - files - {*end}
             files |= imported - {*end}
         return files
-
-
-def _names(*names: str) -> set[str]:
-    return {file.relative_to(PACKAGE).as_posix() for file in sources(*names)}
 
 
 def _is_in(name: str, folders: Iterable[str]) -> bool:
@@ -136,9 +129,7 @@ def _own_imports(file: Path, _modified_ns: int) -> frozenset[str]:
 def code_digest(*names: str) -> str:
     """Return a digest of source files of this package, 16 hexadecimal digits.
 
-    Args:
-        names: Files and folders, relative to the package; a folder stands for every source file
-            below it.
+    Names are relative to the package; that of a folder stands for every source file below it.
     """
     return digest_files({file.relative_to(PACKAGE).as_posix(): file for file in sources(*names)})
 
@@ -146,8 +137,7 @@ def code_digest(*names: str) -> str:
 def sources(*names: str) -> list[Path]:
     """Return the source files that names stand for, see `code_digest`; sorted.
 
-    Raises:
-        XrgsError: There is no such file or folder.
+    It raises XrgsError if there is no such file or folder.
     """
     files: set[Path] = set()
     for name in names:
@@ -159,11 +149,7 @@ def sources(*names: str) -> list[Path]:
 
 
 def digest_files(files: dict[str, Path]) -> str:
-    """Return a digest of source files, 16 hexadecimal digits.
-
-    Args:
-        files: The files by their names, which count for the digest too.
-    """
+    """Return a digest of source files by their names, which count too; 16 hexadecimal digits."""
     sha256 = hashlib.sha256()
     for name, file in sorted(files.items()):
         sha256.update(f"{name}\0{_meaning_of(file, file.stat().st_mtime_ns)}\0".encode())
@@ -183,9 +169,7 @@ def _meaning_of(file: Path, _modified_ns: int) -> str:
 def meaning(text: str, suffix: str) -> str:
     """Return source code without the text that changes no result.
 
-    Args:
-        text: The source code.
-        suffix: `.py`, `.cpp`, `.h` or `.txt` (CMake); other text is returned as it is.
+    `suffix` is `.py`, `.cpp`, `.h` or `.txt` (CMake); other text is returned as it is.
     """
     if suffix == ".py":
         text = _cut(text, _python_spans(text))

@@ -93,9 +93,8 @@ def file_bytes(path: Path) -> int:
 def read_bytes(path: Path, max_bytes: int = MAX_BYTES) -> bytes:
     """Read a regular file of at most `max_bytes`.
 
-    Raises:
-        OSError: The file is missing, larger (EFBIG) or not a regular file (EINVAL); it has the
-            path as `filename`.
+    The OSError for a file that is missing, larger (EFBIG) or not a regular file (EINVAL) has the
+    path as `filename`.
     """
     # Opening a named pipe without O_NONBLOCK waits for its writer.
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
@@ -132,10 +131,7 @@ def sync_name(path: Path) -> None:
 
 
 def sync_tree(folder: Path) -> None:
-    """Wait until all files below a folder are on the disk, with their names.
-
-    The name of the folder itself takes `sync_name`.
-    """
+    """Wait until all files below a folder are on the disk, with their names, but not its own."""
     folders = {folder}
     for name, status in walk_files(folder):
         file = folder / name

@@ -25,17 +25,9 @@ _CHUNK = 1 << 20  # bytes
 
 
 def read(stream: IO[bytes]) -> dict[str, NDArray[Any]]:
-    """Read every array of an archive.
+    """Read the arrays of a seekable archive, writable, by member name without `.npy`.
 
-    Args:
-        stream: The archive, seekable.
-
-    Returns:
-        The arrays by member name without `.npy`, writable.
-
-    Raises:
-        OSError: The stream can't be read.
-        ValueError: It is not such an archive; the message says why.
+    ValueError says why it is not such an archive.
     """
     try:
         return _read(stream)

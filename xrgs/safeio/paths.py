@@ -8,12 +8,8 @@ from pathlib import Path
 def user_path(text: str) -> Path:
     """Return the path that a user wrote, with `~` and `~name` expanded to home folders.
 
-    Args:
-        text: The path as it was typed.
-
-    Returns:
-        The expanded path; the path as it stands where there is no user of that name, or no home
-        folder, as for a user of a container without HOME.
+    It stays as it stands where there is no user of that name, or no home folder, as for a user of a
+    container without HOME.
     """
     try:
         return Path(text).expanduser()

@@ -1,7 +1,7 @@
-"""Reads the vertices of a .ply file: ASCII or binary, any properties, among any other elements.
+"""Reads the vertices of a .ply file: ASCII or binary, any properties, among other elements.
 
-The file may come from anybody. No memory is allocated for declared data before the size of the file
-shows that the data is there.
+Lists, as faces have, are read over only behind the vertices. The file may come from anybody. No
+memory is allocated for declared data before the size of the file shows that the data is there.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ import re
 from collections import deque
 from dataclasses import dataclass, field
 from itertools import islice
-from typing import TYPE_CHECKING, Any, BinaryIO, Literal
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
 from xrgs.errors import XrgsError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Iterable, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -51,8 +51,8 @@ class Ply:
     """The vertices of a .ply file, and its comments."""
 
     vertices: NDArray[np.void]
-    """[V] with a field for each property of the element `vertex` that is not a list, in the file's
-    types and byte order."""
+    """[V] with a field for each property of the element `vertex`, in the file's types and byte
+    order."""
     comments: tuple[str, ...]
     """The comments of the header, without surrounding spaces."""
 
@@ -72,40 +72,24 @@ class Ply:
         return table
 
 
-@dataclass(frozen=True)
-class _Property:
-    name: str
-    kind: str
-    """Type code of numpy without the byte order; for a list, the type of its entries."""
-    length: str = ""
-    """For a list, the type of its length."""
-
-
-@dataclass(frozen=True)
+@dataclass
 class _Element:
     name: str
     count: int
-    properties: list[_Property] = field(default_factory=list)
-
-    @property
-    def has_lists(self) -> bool:
-        return any(prop.length for prop in self.properties)
+    properties: list[tuple[str, str]] = field(default_factory=list)
+    """Names, and type codes of numpy without the byte order."""
+    has_lists: bool = False
 
     def record(self, order: str) -> np.dtype[np.void]:
-        """Return the type of the properties that are no lists."""
-        scalars = [prop for prop in self.properties if not prop.length]
-        return np.dtype([(prop.name, order + prop.kind) for prop in scalars])
+        return np.dtype([(name, order + kind) for name, kind in self.properties])
 
 
 def read(path: Path) -> Ply:
-    """Read the vertices of a .ply file.
-
-    Elements before the vertices are skipped; what follows the vertices is not read. Properties that
-    are lists are left out.
+    """Read the vertices of a .ply file; elements before them are skipped.
 
     Raises:
-        XrgsError: The file can't be read, is no .ply, or is shorter than its header says; the
-            message names it.
+        XrgsError: The file can't be read, is no .ply, is shorter than its header says, or has lists
+            in its vertices or before them; the message names it.
     """
     try:
         with path.open("rb") as file:
@@ -147,12 +131,10 @@ def _parse_header(lines: Iterable[str]) -> tuple[str, list[_Element], tuple[str,
                 form = name
             case ["element", name, count] if re.fullmatch("[0-9]{1,12}", count):
                 elements.append(_Element(name, int(count)))
-            case ["property", "list", length, kind, name] if (
-                elements and kind in _TYPES and _TYPES.get(length, "f")[0] != "f"
-            ):
-                elements[-1].properties.append(_Property(name, _TYPES[kind], _TYPES[length]))
+            case ["property", "list", _, _, _] if elements:
+                elements[-1].has_lists = True
             case ["property", kind, name] if elements and kind in _TYPES:
-                elements[-1].properties.append(_Property(name, _TYPES[kind]))
+                elements[-1].properties.append((name, _TYPES[kind]))
             case _:
                 raise ValueError(f"unexpected line in the .ply header: {line[:80]!r}")
     if not form:
@@ -167,10 +149,12 @@ def _up_to_vertices(elements: list[_Element]) -> tuple[list[_Element], _Element]
         has = ", ".join(names)[:80] or "none"
         raise ValueError(f"the .ply header must have one element vertex, its elements are: {has}")
     at = names.index("vertex")
-    properties = [prop.name for prop in elements[at].properties]
+    if lists := [element.name for element in elements[: at + 1] if element.has_lists]:
+        raise ValueError(f"the element {lists[0]} has lists, and only those behind vertex may")
+    properties = [name for name, _ in elements[at].properties]
     if len(set(properties)) != len(properties):
         raise ValueError("the .ply header names a property of vertex twice")
-    if all(prop.length for prop in elements[at].properties):
+    if not properties:
         raise ValueError("the .ply header names no properties of vertex")
     return elements[:at], elements[at]
 
@@ -179,21 +163,13 @@ def _read_binary(
     file: BinaryIO, before: list[_Element], vertex: _Element, size: int, order: str
 ) -> NDArray[np.void]:
     for element in before:
-        if element.has_lists:
-            deque(_rows_without_lists(file, element, order), maxlen=0)
-        else:
-            file.seek(_checked_bytes(file, element, size), os.SEEK_CUR)
-    if vertex.has_lists:
-        content = b"".join(_rows_without_lists(file, vertex, order))
-        if file.tell() > size:
-            raise ValueError("ends within a list of its last vertex")
-    else:
-        content = _exactly(file, _checked_bytes(file, vertex, size))
-    return np.frombuffer(content, vertex.record(order))
+        file.seek(_checked_bytes(file, element, size), os.SEEK_CUR)
+    content = file.read(_checked_bytes(file, vertex, size))
+    return np.frombuffer(content, vertex.record(order), vertex.count)
 
 
 def _checked_bytes(file: BinaryIO, element: _Element, size: int) -> int:
-    """Return the number of bytes of an element without lists, which must be in the file."""
+    """Return the number of bytes of an element, which must be in the file."""
     needed, remaining = element.count * element.record("=").itemsize, size - file.tell()
     if needed > remaining:
         raise ValueError(
@@ -201,34 +177,6 @@ def _checked_bytes(file: BinaryIO, element: _Element, size: int) -> int:
             f"{remaining} are left in the file"
         )
     return needed
-
-
-def _rows_without_lists(file: BinaryIO, element: _Element, order: str) -> Iterator[bytes]:
-    """Yield the bytes of each row without its lists; each row must have one list at least."""
-    runs, scalars = [], 0  # bytes of the properties before a list, the bytes of its length, ...
-    for prop in element.properties:
-        if prop.length:
-            runs.append((scalars, int(prop.length[1]), prop.length[0] == "i", int(prop.kind[1])))
-            scalars = 0
-        else:
-            scalars += int(prop.kind[1])
-    byte_order: Literal["big", "little"] = "big" if order == ">" else "little"
-    for _ in range(element.count):
-        row = b""
-        for before, length, signed, entry in runs:
-            row += _exactly(file, before)
-            entries = int.from_bytes(_exactly(file, length), byte_order, signed=signed)
-            if entries < 0:
-                raise ValueError(f"a list of the element {element.name} has a length below 0")
-            file.seek(entries * entry, os.SEEK_CUR)
-        yield row + _exactly(file, scalars)
-
-
-def _exactly(file: BinaryIO, count: int) -> bytes:
-    content = file.read(count)
-    if len(content) != count:
-        raise ValueError("ends before its last vertex")
-    return content
 
 
 def _read_ascii(file: BinaryIO, before: list[_Element], vertex: _Element) -> NDArray[np.void]:
@@ -241,27 +189,12 @@ def _read_ascii(file: BinaryIO, before: list[_Element], vertex: _Element) -> NDA
         rows = list(islice(lines, vertex.count))
     if len(rows) < vertex.count:
         raise ValueError(f"has {len(rows)} of its {vertex.count} vertices")
-    if vertex.has_lists:
-        rows = [_line_without_lists(vertex, line) for line in rows]
     # float64 holds every value of every type of .ply. loadtxt warns where there are no lines.
     width = len(record.names or ())
     values = np.loadtxt(rows, ndmin=2, comments=None) if rows else np.empty((0, width))
     if values.shape[1] != width:
         raise ValueError(f"vertices have {values.shape[1]} values, not {width}")
     return _typed(values, record)
-
-
-def _line_without_lists(element: _Element, line: str) -> str:
-    words, kept = iter(line.split()), []
-    try:
-        for prop in element.properties:
-            if prop.length:
-                deque(islice(words, int(next(words))), maxlen=0)
-            else:
-                kept.append(next(words))
-    except StopIteration:
-        raise ValueError(f"a line of the element {element.name} is too short") from None
-    return " ".join([*kept, *words])  # the caller counts, and so refuses superfluous words
 
 
 def _typed(values: NDArray[np.float64], record: np.dtype[np.void]) -> NDArray[np.void]:

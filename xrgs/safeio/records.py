@@ -54,12 +54,7 @@ def read_file(path: Path, max_bytes: int = MAX_BYTES) -> bytes:
 
 
 def list_folder(path: Path) -> list[str]:
-    """Return the sorted names in a folder of a store; none where there is no such folder.
-
-    Raises:
-        UnreadableError: The folder can't be read now.
-        StoreError: The path is not a folder.
-    """
+    """Return the sorted names in a folder of a store; none where there is no such folder."""
     with errors_named(path):
         try:
             return list_names(path)
@@ -68,12 +63,7 @@ def list_folder(path: Path) -> list[str]:
 
 
 def read_struct(path: Path, kind: type[_T], max_bytes: int = MAX_BYTES) -> _T:
-    """Read a JSON file of a declared type.
-
-    Args:
-        path: The file.
-        kind: A `msgspec.Struct`, or another type that msgspec decodes.
-        max_bytes: The largest size that is read.
+    """Read a JSON file of a declared type, a `msgspec.Struct` or another that msgspec decodes.
 
     Raises:
         UnreadableError: The file can't be read now.
@@ -97,14 +87,9 @@ def decode_struct(content: bytes, kind: type[_T], path: Path | str) -> _T:
 
 
 def read_table(path: Path) -> tuple[list[str], list[list[str]]]:
-    """Read a CSV table.
+    """Read a CSV table: the header, whose names are distinct, and rows as long as the header.
 
-    Returns:
-        The header, whose names are distinct, and the rows, each as long as the header.
-
-    Raises:
-        UnreadableError: The file can't be read now.
-        StoreError: The file is missing or damaged; the message names it.
+    It raises as `read_struct` does.
     """
     content = read_file(path)
     try:
@@ -125,10 +110,8 @@ def read_table(path: Path) -> tuple[list[str], list[list[str]]]:
 def table_text(rows: Sequence[Mapping[str, object]]) -> str:
     """Return a CSV table whose texts are kept exactly, so that `read_table` gives them back.
 
-    In a table that is made for people, each text must have gone through `sanitize.for_csv`.
-
-    Args:
-        rows: One mapping a row, of values by column. A value that a row lacks is empty.
+    A value that a row lacks is empty. In a table that is made for people, each text must have gone
+    through `sanitize.for_csv`.
     """
     text = io.StringIO()
     columns = list(dict.fromkeys(column for row in rows for column in row))
@@ -141,8 +124,7 @@ def table_text(rows: Sequence[Mapping[str, object]]) -> str:
 def as_number(value: object) -> float:
     """Convert a value of a JSON or CSV file to a float; NaN for None and the empty string.
 
-    Raises:
-        ValueError: The value is not a number, or is finite and beyond `MAX_NUMBER`.
+    ValueError if the value is not a number, or is finite and beyond `MAX_NUMBER`.
     """
     if value is None or value == "":
         return math.nan

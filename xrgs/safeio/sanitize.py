@@ -62,14 +62,9 @@ _NOT_PDFLATEX = re.compile(
 def for_line(text: str, limit: int = MAX_LINE) -> str:
     """Make a text one line without control, format or invisible characters.
 
-    Args:
-        text: Any text.
-        limit: The most characters that are kept.
-
-    Returns:
-        The text with a space for each character that can't be printed, line breaks among them. A
-        text longer than `limit` ends with an ellipsis and a hash of all of it, so that texts that
-        differ only at their end can still be told apart.
+    A space takes the place of each character that can't be printed, line breaks among them. A text
+    longer than `limit` characters ends with an ellipsis and a hash of all of it, so that texts that
+    differ only at their end can still be told apart.
     """
     if len(text) > limit:
         mark = f"…{_hash(text)[:8]}"
@@ -95,12 +90,8 @@ def for_terminal(text: str) -> str:
 def for_csv(value: object) -> object:
     """Make a value safe for a cell of a table that is opened in a spreadsheet.
 
-    Args:
-        value: The value; anything but a text is returned unchanged.
-
-    Returns:
-        The text as one line, with an apostrophe where a spreadsheet would read a formula. Numbers
-        with a sign are not formulas.
+    A text becomes one line, with an apostrophe where a spreadsheet would read a formula; numbers
+    with a sign are not formulas. Any other value is returned unchanged.
     """
     if not isinstance(value, str):
         return value
@@ -109,11 +100,7 @@ def for_csv(value: object) -> object:
 
 
 def for_markdown(text: str) -> str:
-    """Escape a text so that GitHub's Markdown shows it as it is, without links or HTML.
-
-    Args:
-        text: Any text; the result is one line.
-    """
+    """Escape a text into one line that GitHub's Markdown shows as it is, without links or HTML."""
     escaped = for_line(text).strip().translate(_MARKDOWN)
     return _MARKDOWN_LINK.sub(r"\\\g<0>", _MARKDOWN_START.sub(r"\1\\\2", escaped))
 
@@ -121,9 +108,8 @@ def for_markdown(text: str) -> str:
 def for_latex(text: str) -> str:
     """Escape a text so that LaTeX shows it as it is.
 
-    Args:
-        text: Any text; the hyphen of a negative number becomes a minus sign. pdflatex shows a
-            character that it has no font for by its number, `U+90E8`; xelatex and lualatex show it.
+    The hyphen of a negative number becomes a minus sign. pdflatex shows a character that it has no
+    font for by its number, `U+90E8`; xelatex and lualatex show it.
     """
     escaped = re.sub(r"(?<!\S)-(?=\d)", "$-$", for_line(text).strip().translate(_LATEX))
     return _NOT_PDFLATEX.sub(_by_number_in_pdflatex, escaped)
@@ -137,11 +123,7 @@ def _by_number_in_pdflatex(run: re.Match[str]) -> str:
 def for_file_name(text: str) -> str:
     """Return a text as part of a file name that any system accepts.
 
-    Args:
-        text: The name of a scene, label or condition.
-
-    Returns:
-        At most 67 ASCII characters; different texts give different names.
+    It has at most 67 ASCII characters, and different texts give different names.
     """
     plain = re.sub(r"[^A-Za-z0-9_.]+", "-", text).strip("-.")[:60]
     if text and plain == text:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from PIL import Image
 
@@ -23,15 +21,11 @@ from xrgs.mixture.photographs import PhotoCollection
         ({"fl_x": 4.0, "fl_y": 4.0}, "focal length of 4 and 4 px"),
         ({"fl_x": None, "fl_y": None, "camera_angle_x": 3.13}, "focal length of"),
         ({"fl_x": None, "fl_y": None, "camera_angle_x": 90}, "camera_angle_x=90 must be"),
-        ({"fl_x": None, "fl_y": None, "camera_angle_x": -0.6}, "camera_angle_x=-0.6 must be"),
         ({"fl_x": None, "fl_y": None, "x_fov": 180}, "camera_angle_x=3.14"),
         ({"fl_x": -150.0}, "focal length must be above 0"),
-        ({"fl_x": 0}, "focal length must be above 0"),
         ({"fl_x": float("nan")}, "not valid JSON"),
-        ({"fl_x": 1e6, "fl_y": 1e6}, r"focal length of 1e\+06"),
         ({"fl_y": 900.0}, "focal lengths of 150 and 900 px, too unequal"),
         ({"cx": 900.0}, "principal point at 900, 75 px"),
-        ({"cy": -400.0}, "principal point at 104, -400 px"),
     ],
 )
 def test_a_camera_that_can_not_be_is_refused_by_name(
@@ -42,32 +36,25 @@ def test_a_camera_that_can_not_be_is_refused_by_name(
         poses.read_poses(str(file), photos)
 
 
-@pytest.mark.parametrize("text", [True, False])
 def test_a_camera_of_colmap_that_can_not_be_is_refused_by_name(
-    photos: PhotoCollection, tmp_path: Path, text: bool
+    photos: PhotoCollection, tmp_path: Path
 ) -> None:
-    folder = write_colmap(tmp_path / "a", params=(9.0, 9.0, 102.0, 76.0), text=text)
+    folder = write_colmap(tmp_path / "a", params=(9.0, 9.0, 102.0, 76.0))
     with pytest.raises(XrgsError, match=r"the camera of a, for 204x152 px, has a focal length of"):
         poses.read_poses(str(folder), photos)
 
 
-@pytest.mark.parametrize(
-    "row", [[0, 0, 0, 0], [0, 0, 0, 2], [0.1, 0.2, 0.3, 1], [0, 0, 1, 1], [0, 0, 0, 1.001]]
-)
+@pytest.mark.parametrize("row", [None, [0, 0, 1, 1], [0, 0, 0, 1.001]])
 def test_a_last_row_of_a_projection_is_refused(
-    photos: PhotoCollection, tmp_path: Path, row: list[float]
+    photos: PhotoCollection, tmp_path: Path, row: list[float] | None
 ) -> None:
     matrix = to_world(0)
-    matrix[3] = row
+    if row is None:
+        matrix = matrix.T  # written by columns
+    else:
+        matrix[3] = row
     file = write_transforms(tmp_path / "a", frame={"transform_matrix": matrix.tolist()})
     with pytest.raises(XrgsError, match=r"camera of .*a\.jpg: transform_matrix must be of rows"):
-        poses.read_poses(str(file), photos)
-
-
-def test_a_matrix_written_by_columns_is_refused(photos: PhotoCollection, tmp_path: Path) -> None:
-    frame = {"transform_matrix": to_world(0).T.tolist()}
-    file = write_transforms(tmp_path / "a", frame=frame)
-    with pytest.raises(XrgsError, match="is it of columns"):
         poses.read_poses(str(file), photos)
 
 
@@ -75,12 +62,9 @@ def test_a_matrix_written_by_columns_is_refused(photos: PhotoCollection, tmp_pat
     ("size", "named"),
     [
         ((102, 76), False),
-        ((204, 152), False),
         ((51, 38), False),
         ((205, 153), False),  # twice as large, rounded down
-        ((408, 304), False),
         ((101, 75), True),
-        ((206, 153), True),
         ((153, 114), True),
     ],
 )
@@ -120,29 +104,12 @@ def test_the_model_of_undistorted_images_is_not_taken_for_the_photographs(
         poses.read_poses(str(path), photos)
 
 
-def test_undistorted_images_have_their_own_cameras(
-    photographs: Callable[..., PhotoCollection], tmp_path: Path
-) -> None:
-    photos = photographs(size=(98, 73))
-    path = write_colmap(
-        tmp_path / "dense/sparse",
-        params=(75.0, 75.0, 49.0, 36.5),
-        names=("a.jpg", "b.jpg", "c.jpg"),
-        size=(98, 73),
-    )
-    assert poses.read_poses(str(path), photos).report["notes"] == []
-
-
 @pytest.mark.parametrize(
     ("name", "what"),
     [
         ("poses.zip", "an archive"),
-        ("poses.tar.gz", "an archive"),
         ("cameras.xml", "as Metashape's cameras are"),
         ("project.PSX", "a project of Metashape"),
-        ("bundle.out", "a file of Bundler"),
-        ("model.nvm", "a file of VisualSFM"),
-        ("cameras.sfm", "a file of Meshroom"),
         ("registration.csv", "a table"),
         ("poses_bounds.npy", "LLFF's poses_bounds.npy"),
         ("database.db", "COLMAP's database, which has no poses"),
@@ -175,13 +142,3 @@ def test_a_json_of_another_program_is_named(
     (tmp_path / "a.json").write_text(json.dumps(content))
     with pytest.raises(XrgsError, match=rf"a\.json: not a transforms\.json.*{program}"):
         poses.fingerprint(str(tmp_path / "a.json"))
-
-
-def test_a_model_without_points_has_no_points(photos: PhotoCollection, tmp_path: Path) -> None:
-    folder = write_colmap(tmp_path / "a")
-    before = poses.fingerprint(str(folder))
-    (folder / "points3D.bin").unlink()
-    assert poses.fingerprint(str(folder)) != before
-    model = poses.read_poses(str(folder), photos)
-    assert len(model.points) == 0  # they are triangulated then
-    assert np.allclose(np.linalg.norm(model.viewmats[0][:3, :3], axis=0), 1)

@@ -21,13 +21,12 @@ STORED = (102, 76)
 FORMS = ("binary", "text")
 
 
-@pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("model", [name for name in MODELS if name != "EQUIRECTANGULAR"])
-def test_every_camera_model_is_read(tmp_path: Path, form: str, model: str) -> None:
+def test_every_camera_model_is_read(tmp_path: Path, model: str) -> None:
     count = len(MODELS[model])
     params = (*((150.0,) if MODELS[model][0] == "f" else (150.0, 140.0)), 104.0, 75.0)
     params += tuple(0.25 + 0.125 * i for i in range(count - len(params)))
-    given = colmap.read(write_colmap(tmp_path / "a", model, params, text=form == "text"))
+    given = colmap.read(write_colmap(tmp_path / "a", model, params))
     lens, matrix = given.camera(NAMES[1], STORED)
     assert (lens.width, lens.height) == SIZE
     assert np.allclose(matrix, viewmat(1), atol=1e-9)
@@ -72,14 +71,13 @@ def test_what_images_observe_is_read(tmp_path: Path, form: str) -> None:
     assert given.notes == []
 
 
-@pytest.mark.parametrize("form", FORMS)
-def test_points_behind_their_cameras_are_counted(tmp_path: Path, form: str) -> None:
+def test_points_behind_their_cameras_are_counted(tmp_path: Path) -> None:
     """All of an image whose optical axis was turned round; the mean is of the others."""
-    model = pycolmap.Reconstruction(with_features(tmp_path, form=form))
+    model = pycolmap.Reconstruction(with_features(tmp_path))
     turn = pycolmap.Rigid3d(np.c_[np.diag([-1.0, 1.0, -1.0]), [0, 0, 0]])
     model.images[3].frame.rig_from_world = turn * model.images[3].cam_from_world()
     (tmp_path / "turned").mkdir()
-    (model.write_binary if form == "binary" else model.write_text)(tmp_path / "turned")
+    model.write_binary(tmp_path / "turned")
     given = colmap.read(tmp_path / "turned")
     assert ["9 of 30 observations" in note for note in given.notes] == [True]
     off = np.full((2, len(POINTS)), np.nan)
@@ -90,25 +88,12 @@ def test_points_behind_their_cameras_are_counted(tmp_path: Path, form: str) -> N
     assert given.report == {"reprojection_error_px": pytest.approx(mean)}
 
 
-@pytest.mark.parametrize("form", FORMS)
-def test_points_that_were_filtered_are_not_observed(tmp_path: Path, form: str) -> None:
-    folder = with_features(tmp_path, form=form)
-    thinned = pycolmap.Reconstruction()
-    for n, point in enumerate(POINTS[::2]):
-        thinned.add_point3D(point, pycolmap.Track(), np.full(3, n, np.uint8))
-    thinned.write_text(tmp_path / "bare")
-    rows = (tmp_path / "bare" / "points3D.txt").read_text().splitlines()
-    # The points keep their numbers: 1, 3, 5 and so on.
-    kept = [row for row in rows if not row.startswith("#")]
-    renamed = [f"{2 * i + 1} {row.split(' ', 1)[1]}" for i, row in enumerate(kept)]
-    if form == "text":
-        (folder / "points3D.txt").write_text("\n".join(renamed))
-    else:
-        data = struct.pack("<Q", len(renamed))
-        for i, row in enumerate(renamed):
-            xyz = [float(word) for word in row.split()[1:4]]
-            data += struct.pack("<Q3d3BdQ", 2 * i + 1, *xyz, 1, 2, 3, 0.5, 0)
-        (folder / "points3D.bin").write_bytes(data)
+def test_points_that_were_filtered_are_not_observed(tmp_path: Path) -> None:
+    folder = with_features(tmp_path)
+    data = struct.pack("<Q", len(POINTS[::2]))
+    for i, xyz in enumerate(POINTS[::2]):  # the points keep their numbers: 1, 3, 5 and so on
+        data += struct.pack("<Q3d3BdQ", 2 * i + 1, *xyz, 1, 2, 3, 0.5, 0)
+    (folder / "points3D.bin").write_bytes(data)
     given = colmap.read(folder)
     assert np.allclose(given.points, POINTS[::2])
     assert given.observed[NAMES[0]].tolist() == [1, 2, 3, 4, 5]
@@ -176,18 +161,6 @@ def test_names_with_spaces_are_read_whole(tmp_path: Path) -> None:
     assert given.names == [NAMES[0], "DJI 1 2.jpg", NAMES[2]]
 
 
-@pytest.mark.parametrize("scale", [1.0, 2.0, 1e-3])
-def test_quaternions_of_few_digits_or_another_length_are_rotations(
-    tmp_path: Path, scale: float
-) -> None:
-    quat = pycolmap.Rotation3d(viewmat(1)[:3, :3]).quat * scale
-    digits = {1 + i: f"{quat[(i + 3) % 4]:.4g}" for i in range(4)}
-    folder = edited(tmp_path / "a", "images.txt", words(2, digits))
-    matrix = colmap.read(folder).camera(NAMES[1], STORED)[1]
-    assert np.abs(matrix - viewmat(1)).max() < 3e-4
-    assert matrix[:3, :3] @ matrix[:3, :3].T == pytest.approx(np.eye(3), abs=1e-12)
-
-
 @pytest.mark.parametrize(
     ("file", "change", "message"),
     [
@@ -195,14 +168,11 @@ def test_quaternions_of_few_digits_or_another_length_are_rotations(
         ("images.txt", words(2, {6: "nan"}), "day1/b.jpg: its pose must have finite numbers"),
         ("images.txt", words(2, {9: NAMES[0]}), "images 1 and 2 have one name, day1/a.jpg"),
         ("images.txt", words(2, {8: "7"}), "day1/b.jpg has camera 7, which is missing"),
-        ("images.txt", words(2, {1: "one"}), "line 3 must be IMAGE_ID QW"),
         ("images.txt", lambda x: [x[0], *x[2:]], "line 2 must be X Y POINT3D_ID of each feature"),
         ("cameras.txt", words(0, {4: "-5"}), "focal length must be above 0"),
         ("cameras.txt", words(0, {1: "GLASS"}), "camera model GLASS: must be one of"),
-        ("cameras.txt", lambda x: [x[0][:-6]], "parameters; 4 are needed"),
         ("cameras.txt", words(0, {2: "wide"}), "line 1 must be CAMERA_ID MODEL"),
         ("points3D.txt", words(3, {2: "x"}), "line 4 must be POINT3D_ID X Y Z"),
-        ("points3D.txt", lambda x: [*x[:5], x[5][:20]], "line 6 must be POINT3D_ID X Y Z"),
     ],
 )
 def test_a_line_that_is_wrong_is_named(
@@ -220,7 +190,7 @@ def test_a_line_that_is_wrong_is_named(
 
 
 @pytest.mark.parametrize("file", ["cameras.bin", "images.bin", "points3D.bin"])
-@pytest.mark.parametrize("share", [0.0, 0.2, 0.5, 0.9, 0.999])
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.999])
 def test_a_file_that_was_cut_is_named(tmp_path: Path, file: str, share: float) -> None:
     folder = with_features(tmp_path)
     content = (folder / file).read_bytes()
@@ -230,9 +200,8 @@ def test_a_file_that_was_cut_is_named(tmp_path: Path, file: str, share: float) -
 
 
 @pytest.mark.parametrize("file", ["cameras.bin", "images.bin", "points3D.bin"])
-@pytest.mark.parametrize("count", [2**40, 2**64 - 1])
-def test_a_count_takes_no_memory(tmp_path: Path, file: str, count: int) -> None:
-    folder = with_features(tmp_path)
+def test_a_count_takes_no_memory(tmp_path: Path, file: str) -> None:
+    folder, count = with_features(tmp_path), 2**40
     content = (folder / file).read_bytes()
     (folder / file).write_bytes(struct.pack("<Q", count) + content[8:])
     tracemalloc.start()
@@ -254,8 +223,7 @@ def test_more_bytes_than_entries_and_unknown_models_are_named(tmp_path: Path) ->
         colmap.read(folder)
 
 
-@pytest.mark.parametrize("below", ["", "sparse"])
-@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize(("below", "form"), [("", "text"), ("sparse", "binary")])
 def test_of_several_models_the_one_of_most_images_is_taken(
     tmp_path: Path, below: str, form: str
 ) -> None:
@@ -286,25 +254,13 @@ def test_binary_files_are_preferred_and_a_model_may_have_no_points(tmp_path: Pat
     assert colmap.files(folder) == []
 
 
-@pytest.mark.parametrize("start", ["scan_", "My Project - "])
-@pytest.mark.parametrize("text", [True, False])
-def test_the_names_of_a_model_may_begin_with_that_of_the_project(
-    tmp_path: Path, start: str, text: bool
+@pytest.mark.parametrize("scale", [1.0, 1e-3])
+def test_quaternions_of_few_digits_or_another_length_are_rotations(
+    tmp_path: Path, scale: float
 ) -> None:
-    folder = write_colmap(tmp_path / "a", text=text)
-    plain = colmap.read(folder)
-    for file in list(folder.iterdir()):
-        file.rename(folder / f"{start}{file.name.replace('3D', '3d')}")
-    found = colmap.read(folder)
-    assert list(found.names) == list(plain.names)
-    assert np.array_equal(found.points, plain.points)
-
-
-def test_points_beside_a_model_may_be_in_a_ply(tmp_path: Path) -> None:
-    folder = write_colmap(tmp_path / "a")
-    plain = colmap.read(folder)
-    pycolmap.Reconstruction(folder).export_PLY(folder / "points3D.ply")
-    (folder / "points3D.bin").unlink()
-    found = colmap.read(folder)
-    assert np.allclose(np.sort(found.points, axis=0), np.sort(plain.points, axis=0), atol=1e-6)
-    assert not any(len(indices) for indices in found.observed.values())
+    quat = pycolmap.Rotation3d(viewmat(1)[:3, :3]).quat * scale
+    digits = {1 + i: f"{quat[(i + 3) % 4]:.4g}" for i in range(4)}
+    folder = edited(tmp_path / "a", "images.txt", words(2, digits))
+    matrix = colmap.read(folder).camera(NAMES[1], STORED)[1]
+    assert np.abs(matrix - viewmat(1)).max() < 3e-4
+    assert matrix[:3, :3] @ matrix[:3, :3].T == pytest.approx(np.eye(3), abs=1e-12)

@@ -63,8 +63,9 @@ def pixels(model: Reconstruction, index: int) -> NDArray[np.float64]:
     return projected[:, :2] / projected[:, 2:]
 
 
-@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
-@pytest.mark.parametrize("size", [(100, 75), (75, 100), (100, 100)])
+@pytest.mark.parametrize(
+    ("orientation", "size"), [(1, (100, 75)), (3, (100, 75)), (6, (75, 100)), (8, (100, 100))]
+)
 def test_a_pose_of_stored_pixels_is_turned_as_exif_turns_the_photograph(
     photographs: Callable[..., PhotoCollection],
     tmp_path: Path,
@@ -85,7 +86,7 @@ def test_a_pose_of_stored_pixels_is_turned_as_exif_turns_the_photograph(
     assert [note[: len(notes[0])] for note in model.report["notes"]] == notes * (orientation > 1)
 
 
-@pytest.mark.parametrize("orientation", [5, 6, 7, 8])
+@pytest.mark.parametrize("orientation", [5, 6])
 def test_a_pose_of_upright_pixels_stays_as_it_is(
     photographs: Callable[..., PhotoCollection], tmp_path: Path, orientation: int
 ) -> None:
@@ -114,19 +115,13 @@ def test_one_photograph_decides_for_those_that_fit_both_ways(
         assert pixels(model, i) == pytest.approx(seen, abs=1e-4)  # the points are float32
 
 
-@pytest.mark.parametrize("orientation", [2, 4, 5, 7])
+@pytest.mark.parametrize("orientation", [2, 7])
 def test_a_photograph_that_exif_mirrors_is_refused_by_name(
     photographs: Callable[..., PhotoCollection], tmp_path: Path, orientation: int
 ) -> None:
     path = write_colmap(tmp_path / "poses", size=(100, 75))
     photos = photographs(size=(100, 75), orientation=orientation)
     with pytest.raises(XrgsError, match=f"poses: EXIF's orientation {orientation} mirrors a, "):
-        poses.read_poses(str(path), photos)
-
-
-def test_a_camera_of_another_picture_is_refused(photos: PhotoCollection, tmp_path: Path) -> None:
-    path = write_colmap(tmp_path / "poses", size=(300, 152))
-    with pytest.raises(XrgsError, match=r"300x152 px, .* 102x76: these are not the same picture"):
         poses.read_poses(str(path), photos)
 
 
@@ -152,9 +147,7 @@ def test_the_fingerprint_is_of_the_content(tmp_path: Path) -> None:
     [
         (("x/a.jpg", "gone.png", "d/c.JPG"), ("a", "b", "c", "d/c"), {0: 0, 2: 3}),
         (("images/rig1/back/4.jpg", "images/rig1/front/4.jpg"), ("rig1/back/4", "rig1/front/4"), 1),
-        (("back/4.jpg", "front/4.jpg"), ("rig1/back/4", "rig1/front/4"), 1),
         (("rig1_back_4.jpg", "rig1_front_4.jpg"), ("rig1/back/4", "rig1/front/4"), 1),
-        (("4.jpg", "b/4.jpg"), ("a/4", "b/4"), {1: 1}),
         (("x/c/4.jpg", "x/b/4.jpg"), ("a/4", "b/4"), {1: 1}),
         (("C:\\shots\\a.JPG", "C:\\shots\\b.JPG"), ("a", "b"), 1),
         (("/home/me/a.png", "../b.png"), ("a", "b"), 1),
@@ -172,31 +165,14 @@ def test_a_pose_has_the_photograph_at_the_end_of_its_path(
     assert found == {pose_names[pose]: photo for pose, photo in wanted.items()}
 
 
-def test_of_two_poses_the_one_in_the_same_folder_is_taken() -> None:
+def test_names_that_fit_nothing_or_alike_are_refused() -> None:
+    """But of two poses the one in the same folder is taken."""
     photographs = [("r_0", Path("/lego/train/r_0.png"))]
     assert poses.match_names(["./test/r_0", "./train/r_0"], photographs) == {"./train/r_0": 0}
-
-
-def test_names_that_fit_nothing_or_alike_are_refused() -> None:
     with pytest.raises(XrgsError, match=r"none of its 1 images .*: IMG_01\.jpg is not img_1"):
         poses.match_names(["IMG_01.jpg"], [("other", Path("other.png")), ("img_1", Path("img_1"))])
     with pytest.raises(XrgsError, match=r"two of its images, x/a\.jpg and y/a\.jpg, have the name"):
         poses.match_names(["x/a.jpg", "y/a.jpg"], [("a", Path("a.png"))])
-
-
-def test_poses_without_a_photograph_are_named(photos: PhotoCollection, tmp_path: Path) -> None:
-    path = write_colmap(tmp_path / "poses", names=("a.jpg", "b.jpg", "z.jpg"))
-    assert poses.read_poses(str(path), photos).report["notes"] == [
-        "1 poses fit no photograph, or several: z.jpg",
-    ]
-
-
-def test_what_is_not_there_is_named(tmp_path: Path) -> None:
-    with pytest.raises(XrgsError, match=r"poses=.*/gone: no such folder or file"):
-        poses.fingerprint(str(tmp_path / "gone"))
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(XrgsError, match=r"cameras, images and points3D.*sparse/0"):
-        poses.fingerprint(str(tmp_path / "empty"))
 
 
 def test_masks_of_a_file_are_those_of_the_photographs(tmp_path: Path) -> None:

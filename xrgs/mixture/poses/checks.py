@@ -43,12 +43,8 @@ def same_shape(a: tuple[int, int], b: tuple[int, int]) -> bool:
 def check_camera(lens: Lens, photo: Photograph) -> None:
     """Refuse the camera of another picture, and an impossible camera.
 
-    Args:
-        lens: The camera of the upright photograph, at the size in the file of poses.
-        photo: The photograph.
-
-    Raises:
-        XrgsError: The aspect ratios differ, or the focal length or principal point is impossible.
+    `lens` is the camera of the upright photograph, at the size in the file of poses. XrgsError says
+    that the aspect ratios differ, or that the focal length or principal point is impossible.
     """
     size = lens.width, lens.height
     if not same_shape(size, photo.size):
@@ -78,9 +74,6 @@ def check_places(centres: NDArray[np.float64], points: NDArray[np.float64], far:
         points: The points [P, 3], with the same origin; there may be none.
         far: Distance of this origin from the origin of the given world, for its rounding errors,
             world units.
-
-    Raises:
-        XrgsError: All cameras are at the same place.
     """
     extent = np.linalg.norm(centres, axis=1).max()
     distance = float(np.median(np.linalg.norm(points, axis=1))) if len(points) else 0.0
@@ -96,17 +89,14 @@ def of_other_pictures(
 ) -> list[str]:
     """Return a note on cameras of pictures that are neither the photographs nor smaller copies.
 
-    Such pictures may be those that COLMAP undistorted, whose sides differ by a few px.
+    Such pictures may be those that COLMAP undistorted, whose sides differ by a few px. If pictures
+    with exactly the cameras' sizes are in a folder next to the poses, XrgsError names it.
 
     Args:
         lenses: Index of an upright photograph -> its camera, at the size in the file of poses.
         names: Index of a photograph -> name of its image in the poses.
         photos: The photographs.
         source: The file or folder of the poses.
-
-    Raises:
-        XrgsError: Pictures with exactly the cameras' sizes are in a folder next to the poses; the
-            message names it.
     """
     odd = [i for i, of in lenses.items() if not _is_copy((of.width, of.height), photos[i].size)]
     for i in odd:

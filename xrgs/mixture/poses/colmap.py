@@ -64,24 +64,15 @@ class _Points:
 def files(root: Path) -> list[Path]:
     """Return the files of the model in or below a folder; of several models, the largest one.
 
-    Returns:
-        The paths of cameras, images and, if it exists, points3D; empty if there is no model.
-
-    Raises:
-        OSError: A folder can't be read.
-        XrgsError: A file can't be read.
+    The paths of cameras, images and, if it exists, points3D; empty if there is no model. OSError or
+    XrgsError if a folder or a file can't be read.
     """
     models = _models(root)
     return models[0] if models else []
 
 
 def read(root: Path) -> GivenPoses:
-    """Read the model in or below a folder.
-
-    Raises:
-        UnreadableError: A file can't be read at the moment.
-        XrgsError: A file is malformed; the message names it.
-    """
+    """Read the model in or below a folder; XrgsError names a file that is malformed."""
     models = _models(root)
     cameras_file, images_file, *points_file = models[0]
     binary = cameras_file.suffix == ".bin"
@@ -129,10 +120,8 @@ def _errors(
 ) -> NDArray[np.float64]:
     """Compute the reprojection errors of an image, since errors stored in a model may be outdated.
 
-    Returns:
-        [N, 2] index of each observed point, and the distance of its projection from the feature,
-        px: infinite behind the camera and outside the camera model. Empty if the camera can't be
-        read.
+    [N, 2] index of each observed point, and the distance of its projection from the feature, px:
+    infinite behind the camera and outside the camera model. Empty if the camera can't be read.
     """
     try:
         lens, viewmat = camera(image.name, (0, 0))

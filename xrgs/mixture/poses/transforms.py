@@ -54,31 +54,20 @@ def in_folder(folder: Path) -> list[Path]:
 
 
 def files(parts: Sequence[Path]) -> list[Path]:
-    """Return all files to read: the transforms.json files, and the points and masks they name.
-
-    Raises:
-        UnreadableError: A file can't be read at the moment.
-        XrgsError: A file is malformed.
-    """
+    """Return all files to read: the transforms.json files, and the points and masks they name."""
     contents = _contents(parts)
     return [*parts, *_points_files(contents)[:1], *_masks(_frames(contents)).values()]
 
 
 def masks(parts: Sequence[Path]) -> dict[str, Path]:
-    """Return image name -> mask, of the images with a `mask_path`.
-
-    Raises:
-        As for `files`.
-    """
+    """Return image name -> mask, of the images with a `mask_path`."""
     return _masks(_frames(_contents(parts)))
 
 
 def read(parts: Sequence[Path]) -> GivenPoses:
     """Read the transforms.json, or the files of its splits, and the points.
 
-    Raises:
-        UnreadableError: A file can't be read at the moment.
-        XrgsError: A file is malformed; the message names it.
+    XrgsError names a file that is malformed.
     """
     from xrgs.mixture import colmap
 
@@ -184,9 +173,7 @@ def _notes(
 def _lens(entry: Mapping[str, Any], stored: tuple[int, int]) -> Lens:
     """Return the camera of a frame.
 
-    Args:
-        entry: The values of the frame.
-        stored: Stored width and height of the photograph, px, if the frame has no size.
+    `stored` is the stored width and height of the photograph, px, if the frame has no size.
     """
     if others := [key for key in entry if _NOT_SERVED.fullmatch(key) and np.any(entry[key])]:
         raise XrgsError(f"{others[0]} is not served: undistort the images, or use another camera")

@@ -24,10 +24,7 @@ _MOST_ROUNDED = 1e-3
 
 
 def own_world(viewmats: Mapping[int, Array]) -> tuple[dict[int, Array], Array]:
-    """Move cameras to the standard world.
-
-    Args:
-        viewmats: Index of the photograph -> world to camera [4, 4], rigid.
+    """Move rigid cameras, world to camera [4, 4], to the standard world.
 
     Returns:
         The viewmats in the new world, and the rigid transform [4, 4] from the given world to it.
@@ -56,9 +53,7 @@ def moved_points(points: Array, world: Array) -> Array:
 def rounding(points: Array, moved: Array) -> float | None:
     """Return the size of float32's rounding steps if it is too coarse for the points, else None.
 
-    Args:
-        points: Points [P, 3] in the given world.
-        moved: The points [P, 3] in the world of `own_world`.
+    `points` [P, 3] are in the given world, and `moved` in the world of `own_world`.
     """
     as_32_bits = points.astype(np.float32)
     if not len(points) or not (as_32_bits == points).all():

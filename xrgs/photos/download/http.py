@@ -57,11 +57,12 @@ def download(
     """Download a file; an interrupted download keeps its bytes in `<target>.part`.
 
     The next call continues that part if the server's file is still the same, else it begins again.
-    A try that fails for a reason that may pass is repeated after a growing pause.
+    A try that fails for a reason that may pass is repeated after a growing pause. Only a complete
+    file ever has the name `target`, whose folder is made.
 
     Args:
         url: An http or https address.
-        target: The file to write; its folder is made. Only a complete file ever has this name.
+        target: The file to write.
         max_bytes: The largest accepted size.
         sha256: The expected SHA-256, in hexadecimal; empty to verify nothing.
         redirect_hosts: Further hosts to which the server may redirect, each with its port if

@@ -79,8 +79,7 @@ def fetch_scenes(conf: DatasetConf, names: Iterable[str], root: Path) -> str:
 def _has_photographs(scene: Path) -> bool:
     """Tell whether a scene's folder holds photographs; a missing or empty folder does not.
 
-    Raises:
-        XrgsError: The folder holds something else, which only its owner may remove.
+    It raises XrgsError if the folder holds something else, which only its owner may remove.
     """
     if not scene.exists() or (scene.is_dir() and not any(scene.iterdir())):
         return False

@@ -21,12 +21,9 @@ class UnpackError(XrgsError):
 
 
 def unpack(archive: Path, folder: str, target: Path) -> None:
-    """Write a folder of an archive as `target`: all of it, or nothing.
+    """Write a folder of a zip archive as `target`: all of it, or nothing.
 
-    Args:
-        archive: A zip file.
-        folder: The path of a folder in it, with `/`.
-        target: The folder to make: it must not exist, or be empty. Its parent is made.
+    `target` must not exist, or be empty; its parent is made.
 
     Raises:
         UnpackError: The archive is damaged; the folder is not in it, leads out of itself or is too

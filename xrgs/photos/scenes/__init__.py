@@ -71,13 +71,9 @@ def names(conf: SceneConf, long_side: int = 0) -> list[str]:
 def fingerprint(conf: SceneConf, long_side: int = 0) -> str:
     """Hash the photographs of a scene and the code that provides them: 16 hexadecimal digits.
 
-    Nothing is rendered or decoded for it.
-
-    Args:
-        conf: The scene's config.
-        long_side: `variant.long_side`: the longer side of the HR views, px; 0 for the full size. It
-            chooses among copies of several sizes in a folder, and the procedural scene is rendered
-            at this size.
+    Nothing is rendered or decoded for it. `long_side` is `variant.long_side`, the longer side of
+    the HR views, px, 0 for the full size: it chooses among copies of several sizes in a folder, and
+    the procedural scene is rendered at this size.
 
     Raises:
         XrgsError: The kind is unknown, a value is out of its range, or the photographs are not
@@ -100,11 +96,7 @@ def fingerprint(conf: SceneConf, long_side: int = 0) -> str:
 def resolve(conf: SceneConf, cache: Path, long_side: int = 0) -> Scene:
     """Find a scene's photographs on disk; extract a video's frames, render the procedural scene.
 
-    Args:
-        conf: The scene's config.
-        cache: The folder of rendered scenes; each has a folder of its own, named by its
-            fingerprint.
-        long_side: As for `fingerprint`.
+    In `cache` each rendered scene has a folder of its own, named by its fingerprint.
 
     Raises:
         UnreadableError: The photographs are there, but can't be read now.

@@ -84,14 +84,12 @@ def one_of_each_size(
 ) -> tuple[list[Sequence[Path]], list[str]]:
     """Choose one folder for each set of photographs that LLFF's folders have in several sizes.
 
-    Args:
-        folders: The photographs of each folder; the folders lie in one folder and match `SIZES`.
-        long_side: `variant.long_side`, px. The smallest size that suffices is taken; the largest
-            if none does, or if this is 0. A folder that lacks photographs is not taken.
+    The smallest size that suffices for `variant.long_side`, px, is taken; the largest if none does,
+    or if this is 0. A folder that lacks photographs is not taken. Folders whose sizes don't differ
+    by the factor in their names are different sets.
 
     Returns:
-        The photographs of each set, and notes. Folders whose sizes don't differ by the factor in
-        their names are different sets.
+        The photographs of each set, and notes.
     """
     groups: list[list[Sequence[Path]]] = []
     for files in sorted(folders, key=_factor):
@@ -150,15 +148,11 @@ def without_copies(
 
     These are compared: files of the same bytes; files of one folder with names such as `a.jpg`,
     `a.png`, `a_small.jpg` and `a (1).jpg`; files of one name in two folders; and files at the same
-    place in two folders with equally many files.
-
-    Args:
-        files: The files.
-        folder: The folder to which paths in notes are relative.
-        other_sizes: Files that were left out for another size; their copies are left out, too.
+    place in two folders with equally many files. Copies of `other_sizes`, which were left out for
+    another size, are left out, too.
 
     Returns:
-        The files in their order, and notes.
+        The files in their order, and notes, with paths relative to `folder`.
     """
     same = _identical(files, frozenset(other_sizes))
     left = [file for file in files if file not in same]

@@ -114,15 +114,14 @@ def list_photographs(path: str | None, long_side: int, masks: str | None = None)
 def look(path: str | None, long_side: int, masks: str | None = None) -> Listing:
     """List the image files of a scene's folder, with notes on what was left out.
 
+    The name of a view is the name of the file without its suffix; with `/**` the names of the
+    folders between come before it, joined by `_`.
+
     Args:
         path: `scene.path`, the folder; with `/**` at its end, all folders below it too.
         long_side: `variant.long_side`, px. Of an LLFF scene the smallest copies whose longer side
             is at least this long are taken; the largest if none is, or if this is 0.
         masks: `scene.masks`, a folder that is skipped; None if there is none.
-
-    Returns:
-        The files and the notes. The name of a view is the name of the file without its suffix; with
-        `/**` the names of the folders between come before it, joined by `_`.
 
     Raises:
         UnreadableError: The folder or a file in it can't be read now.
@@ -174,7 +173,7 @@ class _Found:
 
 def _inside(folder: Path, long_side: int, masks: Path | None) -> _Found:
     """List the photographs in a folder itself, or one of the sizes of an LLFF scene."""
-    inside = filter(_is_size, sorted(folder.iterdir()))
+    inside = [one for one in sorted(folder.iterdir()) if SIZES.fullmatch(one.name) and one.is_dir()]
     sizes = {one: files for one in inside if (files := _images_in(one))}
     taken, notes = one_of_each_size([*sizes.values()], long_side)
     by_name = {files[0].parent.name: list(files) for files in taken}
@@ -413,10 +412,6 @@ def _check_heic(files: Sequence[Path]) -> None:
             f"{heic[0]}: {len(heic)} of {len(files)} photographs are HEIC, which needs "
             "pillow-heif: pip install 'xrgs[heic]'"
         )
-
-
-def _is_size(folder: Path) -> bool:
-    return SIZES.fullmatch(folder.name) is not None and folder.is_dir()
 
 
 def _images_in(folder: Path) -> list[Path]:

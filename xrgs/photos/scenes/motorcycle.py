@@ -44,11 +44,7 @@ class Motorcycle:
 
 
 def files() -> dict[str, Path]:
-    """Find the left and the right photograph in scikit-image's wheel, by name.
-
-    Raises:
-        XrgsError: scikit-image, or a file in it, is not installed.
-    """
+    """Find the left and the right photograph in scikit-image's wheel, by name."""
     return {name: bundled_photograph(f"{name}.png") for name in _CX}
 
 

@@ -84,9 +84,7 @@ def _projection(file: Path) -> str:
 def is_of_all_directions(size: tuple[int, int], small: Callable[[int], NDArray[np.uint8]]) -> bool:
     """Return whether a picture shows all directions, 360 by 180 degrees, by its shape and edges.
 
-    Args:
-        size: Width and height of the picture, px.
-        small: Returns the picture in grey, [S, S], for a side S; called only if the shape fits.
+    `small` returns the picture in grey, [S, S], for a side S; it is called only if the shape fits.
     """
     width, height = size
     if not height or abs(width / height / _ASPECT - 1) > _ASPECT_TOLERANCE:

@@ -47,9 +47,6 @@ def provide(home: Path, views: Sequence[str], render: Callable[[Path], None]) ->
         views: The names of the views.
         render: Writes `<view>.png` for each view into the folder that it is given.
 
-    Returns:
-        The images by the names of the views.
-
     Raises:
         UnreadableError: The folder is there, but can't be read now.
     """
@@ -83,11 +80,7 @@ def _damage(home: Path, images: Sequence[str]) -> StoreError | None:
 
 
 def _files(home: Path) -> dict[str, str]:
-    """Read the hash of each file from `scene.json`.
-
-    Raises:
-        StoreError: It is missing, can't be read or is malformed.
-    """
+    """Read the hash of each file from `scene.json`; StoreError if it is missing or damaged."""
     file = home / _MANIFEST
     content = read_struct(file, RenderedScene)
     if content.fingerprint not in {home.name, home.resolve().name}:

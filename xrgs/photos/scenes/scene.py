@@ -73,12 +73,8 @@ class SceneKind(Protocol):
     def names(self, conf: SceneConf, long_side: int) -> list[str]:
         """Return the names of the photographs, sorted, without reading or rendering them.
 
-        Args:
-            conf: The scene's config.
-            long_side: `variant.long_side`, px; 0 for the full size.
-
-        Raises:
-            XrgsError: The photographs are not there; the message names the key.
+        `long_side` is `variant.long_side`, px; 0 for the full size. XrgsError names the key if the
+        photographs are not there.
         """
 
     def digest(self, conf: SceneConf, long_side: int) -> str:
@@ -90,11 +86,8 @@ class SceneKind(Protocol):
     def resolve(self, conf: SceneConf, long_side: int, home: Path) -> Scene:
         """Find the photographs on disk.
 
-        Args:
-            conf: As for `names`.
-            long_side: As for `names`.
-            home: The folder for photographs that are rendered or extracted, see
-                `xrgs.photos.scenes.rendered`. Its name is the scene's fingerprint.
+        `home` is the folder for photographs that are rendered or extracted, see
+        `xrgs.photos.scenes.rendered`. Its name is the scene's fingerprint.
         """
 
 
@@ -123,11 +116,7 @@ def check_views(conf: SceneConf) -> None:
 
 
 def files_digest(files: Mapping[str, Path]) -> str:
-    """Hash the names and bytes of files, in their order: 64 hexadecimal digits of a SHA-256.
-
-    Raises:
-        UnreadableError: A file can't be read now, see `content`.
-    """
+    """Hash the names and bytes of files, in their order, as `content` does."""
     sha256 = hashlib.sha256()
     for name, file in progress(files.items(), "hashing photographs", "file"):
         sha256.update(f"{name}\0{content(file)}\n".encode())
@@ -137,9 +126,8 @@ def files_digest(files: Mapping[str, Path]) -> str:
 def content(file: Path) -> str:
     """Hash the bytes of a photograph: 64 hexadecimal digits of a SHA-256.
 
-    Raises:
-        UnreadableError: The file can't be read now. To leave it out would change the scene whenever
-            a disk or a server fails.
+    It raises UnreadableError for a file that can't be read now: to leave it out would change the
+    scene whenever a disk or a server fails.
     """
     try:
         return _digest(file)
@@ -174,8 +162,7 @@ _digest = remembered(file_digest)
 def bundled_photograph(name: str) -> Path:
     """Find a file in the `data` folder of scikit-image's wheel, without importing scikit-image.
 
-    Raises:
-        XrgsError: scikit-image, or the file in it, is not installed.
+    It raises XrgsError if scikit-image, or the file in it, is not installed.
     """
     spec = find_spec("skimage")
     if spec is None or spec.origin is None:
