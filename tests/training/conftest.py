@@ -1,4 +1,4 @@
-"""How the tests of training compare two results, and the configs that they train."""
+"""How the tests of training compare two results, and what they train."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ import pytest
 import torch
 
 from tests.conftest import composed as compose
+from tests.conftest import ramps
 from xrgs.config import Conf
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
+from xrgs.training.loop import train
 from xrgs.training.recorder import TrainingResult
 
 
@@ -30,3 +32,9 @@ def comparable(result: TrainingResult) -> dict[str, Any]:
 def short() -> Conf:
     """The baseline's config, 40 steps with the fastest renderer that is installed."""
     return compose("train.steps=40", "splat.backend=auto")
+
+
+@pytest.fixture(scope="session")
+def trained() -> TrainingResult:
+    """What `short` makes of `data`; only to be read."""
+    return train(ramps(), compose("train.steps=40", "splat.backend=auto"))

@@ -21,6 +21,11 @@ from xrgs.training.rendering import StepRenderer
 
 FACTOR = 5
 
+#: (config, *views) -> its components.
+Build = Callable[..., Components]
+#: For losses that do not depend on the Gaussians.
+NO_GAUSSIANS = Gaussians(*[torch.empty(0)] * 6)
+
 
 def make_view(tag: str, image: Tensor) -> LoadedView:
     """A view named as its tag in small letters."""
@@ -66,8 +71,8 @@ def off(baseline: Conf) -> ComponentsConf:
 
 
 @pytest.fixture
-def build(baseline: Conf, views: dict[str, LoadedView]) -> Callable[..., Components]:
-    """(config, *views) -> its components; the views are those of `hr` and `lr` if none is given."""
+def build(baseline: Conf, views: dict[str, LoadedView]) -> Build:
+    """The views are those of `hr` and `lr` if none is given."""
 
     def built(conf: ComponentsConf, *given: LoadedView) -> Components:
         points = torch.rand(50, 3, generator=torch.Generator().manual_seed(2)) + 1

@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
 
+from tests.training.components.conftest import Build
 from xrgs.config import ComponentsConf
 from xrgs.errors import XrgsError
-from xrgs.training.components import Components, Step
+from xrgs.training.components import Step
 
 
-@pytest.mark.parametrize("total", [30_000, 3_000])
 @pytest.mark.parametrize(
-    ("nominal", "allowed"), [(0, False), (4990, False), (5000, True), (29_990, True)]
+    ("nominal", "allowed", "total"),
+    [(0, False, 3_000), (4990, False, 3_000), (4999, False, 30_000), (5000, True, 3_000)],
 )
 def test_hr_views_wait_until_the_warm_up_is_over(
     nominal: int,
     allowed: bool,
     total: int,
-    build: Callable[..., Components],
+    build: Build,
     off: ComponentsConf,
     hr: Step,
     lr: Step,
@@ -32,9 +32,7 @@ def test_hr_views_wait_until_the_warm_up_is_over(
     assert parts.allows_view(replace(lr, number=number, total=total))
 
 
-def test_without_lr_views_it_is_an_error(
-    build: Callable[..., Components], off: ComponentsConf, hr: Step
-) -> None:
+def test_without_lr_views_it_is_an_error(build: Build, off: ComponentsConf, hr: Step) -> None:
     off.curriculum.lr_only = 5000
     with pytest.raises(XrgsError, match=r"^components\.curriculum\.lr_only=5000: .*no LR view"):
         build(off, hr.view)

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import pytest
 import torch
 from torch import Tensor
 
+from tests.training.components.conftest import Build
 from xrgs.config import ComponentsConf
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.training.components import Components, Step
 
 
 @pytest.fixture
-def scaling(build: Callable[..., Components], off: ComponentsConf) -> Components:
+def scaling(build: Build, off: ComponentsConf) -> Components:
     off.gradient_scaling.lr_scale = 0.3
     return build(off)
 
@@ -37,11 +36,3 @@ def test_only_the_scales_gradient_is_scaled(
     assert (gradients["scales"] != 0).all()
     norm = gradients["scales"].norm().item()
     assert steps[tag].log == {f"gradient_scaling.norm_{tag}": pytest.approx(norm)}
-
-
-def test_without_a_gradient_there_is_nothing_to_scale(
-    scaling: Components, lr: Step, gaussians: Gaussians
-) -> None:
-    gaussians.scales.grad = None
-    scaling.after_backward(gaussians, lr)
-    assert gaussians.scales.grad is None

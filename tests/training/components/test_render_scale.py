@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 import torch
 
-from tests.training.components.conftest import make_view
+from tests.training.components.conftest import Build, make_view
 from xrgs.config import ComponentsConf
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
-from xrgs.training.components import Components, Step
-
-Build = Callable[..., Components]
+from xrgs.training.components import Step
 
 
 @pytest.fixture
@@ -50,17 +48,10 @@ def test_resolution_is_the_longer_side_of_the_largest_view(
 ) -> None:
     on.render_scale.gamma = 1.0
     turned, wide = make_view("LR", torch.zeros(40, 20, 3)), make_view("HR", torch.zeros(30, 80, 3))
-    parts = build(on, turned, wide)
-    plain = gaussians.activated()
-    torch.testing.assert_close(
-        parts.before_render(plain, Step(0, 1, turned)).scales, plain.scales * 2
-    )
-
-
-def test_an_lr_view_of_full_size_stays_as_it_is(
-    build: Build, on: ComponentsConf, gaussians: Gaussians
-) -> None:
-    blurred, sharp = (make_view(tag, torch.zeros(40, 60, 3)) for tag in ("LR", "HR"))
-    step, plain = Step(0, 1, blurred), gaussians.activated()
-    assert torch.equal(build(on, blurred, sharp).before_render(plain, step).scales, plain.scales)
+    full = replace(make_view("LR", torch.zeros(30, 80, 3)), name="full")
+    parts, plain = build(on, turned, wide, full), gaussians.activated()
+    inflated = parts.before_render(plain, Step(0, 1, turned))
+    torch.testing.assert_close(inflated.scales, plain.scales * 2)
+    step = Step(0, 1, full)
+    assert torch.equal(parts.before_render(plain, step).scales, plain.scales)
     assert step.log == {"render_scale.k": 1.0}  # the history shows that nothing was scaled
