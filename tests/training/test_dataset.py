@@ -11,6 +11,7 @@ from PIL import Image
 from xrgs.errors import XrgsError
 from xrgs.mixture.views import Variant, View
 from xrgs.photos import images
+from xrgs.photos.images import ImageError
 from xrgs.training import dataset
 from xrgs.training.dataset import LoadedView
 
@@ -114,6 +115,12 @@ def test_a_use_without_views_is_refused(variant: Variant) -> None:
         dataset.load(high, "lr_only")
     with pytest.raises(XrgsError, match=r"views=best: must be one of mixed, all_hr, hr_only, lr"):
         dataset.load(variant, "best")
+
+
+def test_an_image_of_another_size_than_the_list_says_is_named(variant: Variant) -> None:
+    views = tuple(replace(v, width=v.width + 1) if v.name == "v3" else v for v in variant.views)
+    with pytest.raises(ImageError, match=r"train/v3\.png: .*it has 20 x 15 pixels, not 21 x 15"):
+        dataset.load(replace(variant, views=views))
 
 
 @pytest.mark.parametrize("of", ["points", "cameras"])

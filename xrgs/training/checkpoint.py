@@ -69,10 +69,9 @@ class Checkpoint:
         self._written_at = time.monotonic()
 
     def load(self) -> int | None:
-        """Read the file; each object's state is restored when the object is registered.
+        """Read the file, and return the number of steps done; None if there is no file.
 
-        Returns:
-            The number of steps done; None if there is no file.
+        Each object's state is restored when the object is registered.
 
         Raises:
             CheckpointError: The file is damaged, or belongs to another cell; the message names the

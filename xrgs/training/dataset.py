@@ -88,7 +88,7 @@ class Dataset:
 def load(
     variant: Variant, use: str = "mixed", *, validation: float = 0.0, seed: int = 0
 ) -> Dataset:
-    """Read a variant's images and normalise its world.
+    """Read a variant's images, in its order, and normalise its world.
 
     Poses, points and world depend neither on `use` nor on `validation`: SfM has registered all
     views, also held-out and test views. So the controls differ from `mixed` only in the training
@@ -104,9 +104,6 @@ def load(
         seed: The cell's seed, which selects the held-out views: seeds 0, 1, ... hold out one part
             of the HR views after another, so that 1 / `validation` seeds are the folds of a
             cross-validation. The selection depends only on the variant, `validation` and `seed`.
-
-    Returns:
-        The dataset, with views in the order of the variant.
 
     Raises:
         UnreadableError: An image can't be read at the moment.

@@ -38,15 +38,12 @@ class StepRenderer:
     """
 
     components: Components
-    """The components of the run."""
     raster: RasterSettings
-    """How Gaussians become pixels."""
     sh_every: int
     """Steps of this run between the activations of two bands of the spherical harmonics."""
     backend: str
     """`torch` or `native`."""
     recorder: TrainingRecorder
-    """Counts the alpha evaluations."""
 
     def sh_degree(self, step: Step) -> int:
         """Return the highest band of the spherical harmonics that is on at a step."""

@@ -75,14 +75,13 @@ class Weighting(Component):
         *,
         stat_from: str = "weighted",
     ) -> None:
-        """Combine a weight with its attenuations.
+        """Combine a weight with its attenuations, all of them in 0..1.
 
         Args:
-            view_weight: Returns the lowest weight of a view, in 0..1.
-            attenuations: Functions that return an attenuation at a step, in 0..1.
-            regions: View name -> attenuations of its pixels [H, W], in 0..1.
-            stat_from: `weighted`, or `unweighted` for image-plane gradients without weights in
-                densification.
+            view_weight: Returns the lowest weight of a view.
+            attenuations: Functions that return an attenuation at a step.
+            regions: View name -> attenuations of its pixels [H, W].
+            stat_from: `weighted`, or `unweighted` for densification without the weights.
         """
         if stat_from not in _STATISTICS:
             raise XrgsError(
