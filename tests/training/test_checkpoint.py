@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import logging
 import os
-import pickle
-import zipfile
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -139,28 +137,6 @@ def test_a_flipped_bit_another_cell_and_a_missing_state_are_refused(tmp_path: Pa
     file.write_bytes(content)
     with pytest.raises(CheckpointError, match="damaged"):
         Checkpoint(file, "cell").load()
-
-
-class MakesFolder:
-    """Makes a folder when it is unpickled."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return os.mkdir, (str(self.folder),)
-
-
-def test_a_pickle_is_never_run(tmp_path: Path) -> None:
-    file, folder = tmp_path / "c.npz", tmp_path / "made"
-    with zipfile.ZipFile(file, "w") as archive, archive.open("state.json", "w") as member:
-        objects = np.array([MakesFolder(folder)], object)
-        np.lib.format.write_array(member, objects, allow_pickle=True)
-    with pytest.raises(CheckpointError, match=r"c\.npz"):
-        Checkpoint(file, "cell").load()
-    assert not folder.exists()
-    pickle.loads(pickle.dumps(MakesFolder(folder)))  # noqa: S301 - shows that it would have worked
-    assert folder.exists()
 
 
 def test_a_state_that_does_not_fit_is_refused_by_its_object(

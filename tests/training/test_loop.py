@@ -244,22 +244,6 @@ def test_evaluation_changes_no_bit_takes_no_time_and_sees_what_would_be_saved(
     assert 0 < work[0] < work[1] < work[2] < result.evaluations
 
 
-def test_extra_components_run_behind_those_of_the_config(data: Dataset, short: Conf) -> None:
-    class Doubling(components.Component):
-        def modify_loss(
-            self, loss: torch.Tensor, image: torch.Tensor, gaussians: Gaussians, step: Step
-        ) -> torch.Tensor:
-            step.log["loss.before"] = loss.item()
-            return 2 * loss
-
-    short.train.steps = 4
-    short.components.loss_weighting.lr_weight = 0.25
-    first = train(data, short, extra_components=[Doubling()]).history
-    assert [row["loss"] for row in first] == [2 * row["loss.before"] for row in first]
-    plain = train(data, short).history
-    assert first[0]["loss.before"] == plain[0]["loss"]
-
-
 class Choosing(components.Component):
     """Lets every second Gaussian grow, and removes the last three of them at some steps."""
 

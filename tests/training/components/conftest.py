@@ -82,8 +82,7 @@ def build(baseline: Conf, views: dict[str, LoadedView]) -> Build:
     return built
 
 
-@pytest.fixture
-def gaussians() -> Gaussians:
+def gaussians_with_gradients() -> Gaussians:
     """Six Gaussians with a gradient in every value."""
     shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3)}
     generator = torch.Generator().manual_seed(0)
@@ -97,10 +96,8 @@ def gaussians() -> Gaussians:
 
 
 @pytest.fixture
-def gradients(gaussians: Gaussians) -> dict[str, Tensor]:
-    """A copy of the gradients of `gaussians`, by parameter."""
-    parameters = {name: gaussians[name] for name in PARAMETERS}
-    return {name: p.grad.clone() for name, p in parameters.items() if p.grad is not None}
+def gaussians() -> Gaussians:
+    return gaussians_with_gradients()
 
 
 @pytest.fixture
