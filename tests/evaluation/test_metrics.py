@@ -17,7 +17,6 @@ from xrgs.evaluation import metrics
 from xrgs.evaluation.lpips import weights
 from xrgs.photos import masks
 
-
 #: Whether more of it is better, from the metrics' own papers and common sense, not from the code.
 MORE_IS_BETTER = {
     "training_time_s": False,
