@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -11,6 +12,7 @@ from tests.conftest import composed as compose
 from tests.conftest import ramps
 from xrgs.config import Conf
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
+from xrgs.training.dataset import Dataset
 from xrgs.training.loop import train
 from xrgs.training.recorder import TrainingResult
 
@@ -26,6 +28,16 @@ def comparable(result: TrainingResult) -> dict[str, Any]:
     others = {name: value for name, value in vars(result).items() if name != "gaussians"}
     columns = [list(row) for row in result.history]
     return parameters | others | {"seconds": None, "stage_seconds": None, "columns": columns}
+
+
+def masked(data: Dataset) -> Dataset:
+    """The dataset with a third of every photograph outside a mask."""
+    views = []
+    for view in data.train:
+        mask = torch.ones(view.camera.height, view.camera.width, dtype=torch.bool)
+        mask[: len(mask) // 3] = False
+        views.append(replace(view, mask=mask))
+    return replace(data, train=tuple(views))
 
 
 @pytest.fixture

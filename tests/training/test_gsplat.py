@@ -6,7 +6,6 @@ GPU's rules for the GPU (`tests/fake_gpu.py`).
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ import torch
 from tests.conftest import composed as compose
 from tests.fake_gpu import DEVICE, fake_gpu
 from tests.gsplat_stand_in import ALPHA_MAX, stand_in
-from tests.training.conftest import comparable
+from tests.training.conftest import comparable, masked
 from xrgs.config import Conf
 from xrgs.evaluation import protocol
 from xrgs.splat.gaussians import PARAMETERS
@@ -74,16 +73,6 @@ def test_fifty_steps_are_those_of_the_native_backend(data: Dataset, ablation: st
             name: pytest.approx(value, rel=1e-3, abs=1e-5) if isinstance(value, float) else value
             for name, value in expected.items()
         }
-
-
-def masked(data: Dataset) -> Dataset:
-    """The dataset with a third of every photograph outside a mask."""
-    views = []
-    for view in data.train:
-        mask = torch.ones(view.camera.height, view.camera.width, dtype=torch.bool)
-        mask[: len(mask) // 3] = False
-        views.append(dataclasses.replace(view, mask=mask))
-    return dataclasses.replace(data, train=tuple(views))
 
 
 @pytest.mark.parametrize("training", TRAININGS)

@@ -16,7 +16,7 @@ from omegaconf import OmegaConf
 
 from tests.conftest import composed as compose
 from tests.conftest import ramps
-from tests.training.conftest import same
+from tests.training.conftest import masked, same
 from xrgs.config import CONF_DIR, Conf
 from xrgs.errors import XrgsError
 from xrgs.splat.gaussians import ActivatedGaussians, Gaussians, from_points
@@ -321,13 +321,7 @@ def test_every_ablation_trains_with_plus_exposure_and_masks(data: Dataset) -> No
     """Their 20 steps go through densification, selection and the late factor of `supersampled`."""
     others = ",".join(sorted({*ABLATIONS} - IN_PLUS - {"mcmc", "count_matched", "exposure_gain"}))
     conf = compose(*SHORT, f"+ablation=[plus,{others},xrgs_per_class,hybrid_schedule]")
-    masked = [
-        dataclasses.replace(
-            view, mask=(torch.arange(view.image.shape[1]) > 3).repeat(len(view.image), 1)
-        )
-        for view in data.train
-    ]
-    result = train(dataclasses.replace(data, train=tuple(masked)), conf)
+    result = train(masked(data), conf)
     assert all(math.isfinite(row["loss"]) for row in result.history)
     assert len({row["exposure.gain"] for row in result.history}) > 1
 
