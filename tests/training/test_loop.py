@@ -270,6 +270,7 @@ class Choosing(components.Component):
 def test_components_choose_what_grows_and_what_goes_at_any_step(data: Dataset) -> None:
     conf = compose("train.steps=30", "splat.densify.every=5000", "splat.densify.grow_grad2d=0")
     conf.splat.densify.start, conf.splat.densify.stop = 0, 6000  # one refinement, at step 5
+    conf.splat.densify.reset_every = 50_000  # never; large Gaussians would go after it
     choosing = Choosing(prune_at=(7, 10, 23))
     result = train(data, conf, extra_components=[choosing])
     last = result.history[-1]

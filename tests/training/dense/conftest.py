@@ -64,10 +64,10 @@ def true_depths(rays: Array, viewmat: Array) -> Array:
     return nearest
 
 
-def true_scene(count: int, width: int, first: int | None = None) -> TrueScene:
-    """Render the first of `count` views, `width` px wide, two thirds at `FACTOR` times less."""
+def true_scene(count: int, width: int) -> TrueScene:
+    """Render views of the embedded scene, `width` px wide, two thirds at `FACTOR` times less."""
     height = width * 3 // 4
-    K, viewmats = procedural.intrinsics(width, height), procedural.viewmats(count)[:first]
+    K, viewmats = procedural.intrinsics(width, height), procedural.viewmats(count)
     textures = {name: still_life._pyramid(*of) for name, of in procedural.TEXTURES.items()}
     images = [
         raycast.render(
