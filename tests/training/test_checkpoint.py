@@ -67,7 +67,7 @@ def few_steps(short: Conf) -> Conf:
 values = st.floats(allow_nan=False) | st.integers() | st.text() | st.none() | st.booleans()
 
 
-@settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(value=st.lists(values), bits=st.lists(st.integers(0, 2**32 - 1), max_size=9))
 def test_values_come_back_to_the_last_bit(
     tmp_path: Path, value: list[Any], bits: list[int]

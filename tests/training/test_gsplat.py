@@ -78,7 +78,7 @@ def test_fifty_steps_are_those_of_the_native_backend(data: Dataset, ablation: st
 @pytest.mark.parametrize("training", TRAININGS)
 def test_training_leaves_no_tensor_on_the_processor(data: Dataset, training: str) -> None:
     conf = compose(
-        *("splat.backend=gsplat", ALPHA_MAX, "train.steps=12", "splat.densify.every=5000"),
+        *("splat.backend=gsplat", ALPHA_MAX, "train.steps=8", "splat.densify.every=7500"),
         *TRAININGS[training],
     )
     with stand_in(DEVICE.type), fake_gpu():
@@ -94,11 +94,12 @@ class Kill(BaseException):
 def test_a_killed_run_continues(
     data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    conf, calls = config("plus", "train.steps=12", "splat.densify.every=7500"), [0]
+    conf, calls = config("mip", "train.steps=8", "splat.densify.every=7500"), [0]
+    conf.components.exposure.mode = "affine"
 
     def mortal(*arguments: Any, **named: Any) -> Any:
         calls[0] += 1
-        if calls[0] == 18:
+        if calls[0] == 13:
             raise Kill
         return photometric_loss(*arguments, **named)
 
@@ -111,7 +112,7 @@ def test_a_killed_run_continues(
         with pytest.raises(Kill):
             train(data, conf, checkpoint())
         continued = checkpoint()
-        assert continued.load() == 5
+        assert continued.load() == 4
         again = train(data, conf, continued)
     assert comparable(again) == comparable(whole)
 

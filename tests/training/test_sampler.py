@@ -72,7 +72,7 @@ def test_it_is_an_error_where_no_view_is_allowed(data: Dataset) -> None:
 HIGH = {"v0", "v2"}
 
 
-@pytest.mark.parametrize(("share", "seed"), [(0.51, 0), (0.6, 7), (0.9, 0)])
+@pytest.mark.parametrize(("share", "seed"), [(0.51, 0), (0.9, 7)])
 def test_a_share_of_hr_views_holds_in_every_window(data: Dataset, share: float, seed: int) -> None:
     steps = 30_000
     names = sampled_names(data, steps, always, seed, share)

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
@@ -48,6 +48,7 @@ def weight(parts: Components | Component, view: TrainingView, number: int = 0) -
     return parts.modify_loss(loss, view.image, NO_GAUSSIANS, Step(number, 30_000, view)).item()
 
 
+@settings(max_examples=30)
 @given(base=unit, attenuations=st.lists(unit, max_size=3), seed=st.integers(0, 10**6))
 def test_every_weight_lies_between_the_view_weight_and_1(
     base: float, attenuations: list[float], seed: int
