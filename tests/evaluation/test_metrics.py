@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import subprocess
-import sys
 from collections.abc import Callable
 
 import numpy as np
@@ -77,6 +75,7 @@ def test_ssim_is_its_definition() -> None:
     expected = ssim_map_by_definition(image, target).mean()
     assert 0.2 < expected < 0.9
     assert metrics.ssim(image, target) == pytest.approx(expected, abs=1e-6)
+    assert metrics.ssim(image, image) == pytest.approx(1, abs=1e-6)
 
 
 def test_ssim_differs_from_scikit_images_by_the_border_alone() -> None:
@@ -95,11 +94,6 @@ def test_ssim_differs_from_scikit_images_by_the_border_alone() -> None:
     assert metrics.ssim(image, target) == pytest.approx(expected, abs=5e-3)
 
 
-def test_ssim_of_identical_images_is_one() -> None:
-    image, _ = pair()
-    assert metrics.ssim(image, image) == pytest.approx(1, abs=1e-6)
-
-
 def test_psnr_is_scikit_images_and_kornias() -> None:
     from kornia.metrics import psnr
     from skimage.metrics import peak_signal_noise_ratio
@@ -111,21 +105,10 @@ def test_psnr_is_scikit_images_and_kornias() -> None:
         rel=1e-12,
     )
     assert value == pytest.approx(psnr(image, target, 1.0).item(), rel=1e-6)
-
-
-def test_psnr_of_a_known_error() -> None:
     flat = torch.full((12, 13, 3), 0.25)
     assert metrics.psnr(flat, flat + 0.5) == pytest.approx(20 * math.log10(2), rel=1e-12)
     assert metrics.psnr(torch.zeros(12, 13, 3), torch.ones(12, 13, 3)) == 0
-
-
-def test_psnr_of_identical_images_is_infinite() -> None:
-    image, _ = pair()
     assert metrics.psnr(image, image) == math.inf
-
-
-def test_lpips_is_none_where_there_are_no_weights() -> None:
-    assert metrics.lpips(*pair()) is None
 
 
 def test_lpips_is_the_networks_distance_where_there_are(
@@ -133,8 +116,9 @@ def test_lpips_is_the_networks_distance_where_there_are(
 ) -> None:
     from xrgs.evaluation.lpips.network import distance
 
-    monkeypatch.setattr(weights, "load_published", lambda: random_weights)
     image, target = pair()
+    assert metrics.lpips(image, target) is None
+    monkeypatch.setattr(weights, "load_published", lambda: random_weights)
     tensors = {name: torch.from_numpy(array) for name, array in random_weights.items()}
     value = metrics.VIEW_METRICS["lpips"](image, target, None)
     assert isinstance(value, float)
@@ -143,55 +127,38 @@ def test_lpips_is_the_networks_distance_where_there_are(
     assert metrics.lpips(*pair(30, 53)) is None
 
 
-def test_the_rows_of_the_tables() -> None:
+def test_directions_are_true(
+    random_weights: weights.Weights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A worse image scores on the worse side."""
+    monkeypatch.setattr(weights, "load_published", lambda: random_weights)
+    image, target = pair()
     better_high = {metric.name: metric.higher_is_better for metric in metrics.METRICS}
     assert better_high == MORE_IS_BETTER
-    assert list(metrics.VIEW_METRICS) == ["lpips", "ssim", "psnr", "psnr_plain", "psnr_fitted"]
-    units = {metric.name: metric.unit for metric in metrics.METRICS if metric.unit}
-    assert units == {
-        "training_time_s": "s",
-        "render_time_ms": "ms",
-        "memory_bytes": "bytes",
-        "peak_rss_bytes": "bytes",
-        "psnr": "dB",
-        "psnr_pooled": "dB",
-        "psnr_worst": "dB",
-        "psnr_plain": "dB",
-        "psnr_fitted": "dB",
-    }
-
-
-@pytest.mark.parametrize("name", ["psnr", "ssim"])
-def test_directions_are_true(name: str) -> None:
-    """A worse image scores on the worse side."""
-    metric = next(metric for metric in metrics.METRICS if metric.name == name)
-    assert metric.score is not None
-    image, target = pair()
-    near = metric.score(target + 0.1 * (image - target), target, None)
-    far = metric.score(image, target, None)
-    assert near is not None
-    assert far is not None
-    assert (near > far) == metric.higher_is_better
+    for metric in metrics.METRICS:
+        if metric.score is not None and metric.name not in {"lpips_vgg", "psnr_plain"}:
+            near = metric.score(target + 0.1 * (image - target), target, None)
+            far = metric.score(image, target, None)
+            assert near is not None
+            assert far is not None
+            assert (near > far) == metric.higher_is_better, metric.name
 
 
 @pytest.mark.parametrize("score", metrics.VIEW_METRICS.values(), ids=metrics.VIEW_METRICS)
-@pytest.mark.parametrize("shapes", [((9, 9, 3), (9, 8, 3)), ((9, 9), (9, 9)), ((3, 9, 9),) * 2])
 def test_wrong_shapes_are_refused(
     score: Callable[[Tensor, Tensor, Tensor | None], float | None],
-    shapes: tuple[tuple[int, ...], tuple[int, ...]],
 ) -> None:
-    mask = torch.ones(shapes[1][:2], dtype=torch.bool)
-    with pytest.raises(ValueError, match=r"must be the same \[H, W, 3\]"):
-        score(torch.zeros(shapes[0]), torch.zeros(shapes[1]), mask)
-
-
-@pytest.mark.parametrize("score", [metrics.psnr, metrics.ssim, metrics.lpips])
-def test_a_mask_of_another_size_is_refused(
-    score: Callable[[Tensor, Tensor, Tensor | None], float | None],
-) -> None:
+    for shapes in ((9, 9, 3), (9, 8, 3)), ((9, 9), (9, 9)), ((3, 9, 9), (3, 9, 9)):
+        image, target = map(torch.zeros, shapes)
+        with pytest.raises(ValueError, match=r"must be the same \[H, W, 3\]"):
+            score(image, target, torch.ones(target.shape[:2], dtype=torch.bool))
     image, target = pair()
-    with pytest.raises(ValueError, match=r"mask \[40, 40\] must be \[40, 53\]"):
-        score(image, target, torch.ones(40, 40, dtype=torch.bool))
+    if score is not metrics.psnr_plain:
+        with pytest.raises(ValueError, match=r"mask \[40, 40\] must be \[40, 53\]"):
+            score(image, target, torch.ones(40, 40, dtype=torch.bool))
+    with pytest.raises(ValueError, match="20 x 5 px is too small for SSIM"):
+        metrics.ssim(torch.zeros(5, 20, 3), torch.zeros(5, 20, 3))
+    assert metrics.ssim(torch.zeros(6, 20, 3), torch.zeros(6, 20, 3)) == pytest.approx(1, abs=1e-4)
 
 
 def half_mask() -> Tensor:
@@ -247,22 +214,6 @@ def test_a_colour_map_of_the_photograph_costs_nothing_after_a_fit() -> None:
     assert flat == pytest.approx(-10 * math.log10(centred.square().mean()), abs=1e-4)
 
 
-def test_cc_psnr_of_gsplat_is_another_number() -> None:
-    """gsplat 1.6.0, color_correct_affine: a line a channel from photograph to render, inverted."""
-    _, target = pair()
-    image = target @ torch.tensor([[0.5, 0.4, 0.1], [0.1, 0.5, 0.4], [0.4, 0.1, 0.5]])
-    corrected = torch.empty_like(image)
-    for channel in range(3):
-        render, photo = (of[..., channel].double().numpy() for of in (image, target))
-        slope, offset = np.polyfit(photo.ravel(), render.ravel(), 1)
-        corrected[..., channel] = torch.from_numpy((render - offset) / slope).clamp(0, 1)
-    theirs, ours = metrics.psnr(corrected, target), metrics.psnr_fitted(image, target)
-    assert theirs is not None
-    assert ours is not None
-    assert theirs < 30
-    assert ours > 120
-
-
 def test_ssim_inside_a_mask_is_the_mean_of_the_definition_there() -> None:
     (image, target), mask = pair(), half_mask()
     filled = torch.from_numpy(masks.filled(target.numpy(), mask.numpy()))
@@ -293,16 +244,3 @@ def test_views_that_are_scored_together_have_the_same_scores() -> None:
     assert metrics.score_view(image, target, None, masked=True) == plain | {
         "psnr_plain": plain["psnr"]
     }
-
-
-def test_an_image_too_small_to_mirror_is_refused() -> None:
-    with pytest.raises(ValueError, match="20 x 5 px is too small for SSIM"):
-        metrics.ssim(torch.zeros(5, 20, 3), torch.zeros(5, 20, 3))
-    assert metrics.ssim(torch.zeros(6, 20, 3), torch.zeros(6, 20, 3)) == pytest.approx(1, abs=1e-4)
-
-
-def test_plans_and_reports_need_no_torch() -> None:
-    heavy = "{'torch', 'kornia'} & set(sys.modules)"
-    code = f"import sys, xrgs.evaluation.metrics; sys.exit(bool({heavy}))"
-    run = subprocess.run([sys.executable, "-P", "-c", code], check=False)
-    assert run.returncode == 0

@@ -88,16 +88,15 @@ def test_all_hr_takes_originals_from_the_same_poses(variant: Variant) -> None:
         assert torch.equal(a.camera.viewmat, b.camera.viewmat)
 
 
-@pytest.mark.parametrize(("use", "names"), [("hr_only", ["v1"]), ("lr_only", ["v2", "v3", "v4"])])
-def test_one_class_alone(variant: Variant, use: str, names: list[str]) -> None:
-    assert [v.name for v in dataset.load(variant, use).train] == names
-
-
 @pytest.mark.parametrize("use", ["all_hr", "hr_only", "lr_only"])
 def test_the_world_and_the_tests_are_the_same_whatever_is_trained_on(
     variant: Variant, use: str
 ) -> None:
-    mixed, other = dataset.load(variant), dataset.load(variant, use)
+    # Nor do originals move the world.
+    without = replace(variant, views=tuple(v for v in variant.views if v.split != "original"))
+    mixed, other = dataset.load(without), dataset.load(variant, use)
+    names = {"all_hr": ["v1", "v2", "v3", "v4"], "hr_only": ["v1"], "lr_only": ["v2", "v3", "v4"]}
+    assert [v.name for v in other.train] == names[use]
     assert other.scene_scale == mixed.scene_scale
     assert torch.equal(other.points, mixed.points)
     assert torch.equal(other.test[0].camera.viewmat, mixed.test[0].camera.viewmat)
@@ -106,30 +105,15 @@ def test_the_world_and_the_tests_are_the_same_whatever_is_trained_on(
     assert all(torch.equal(v.camera.viewmat, poses[v.name]) for v in other.train)
 
 
-def test_originals_do_not_move_the_world(variant: Variant) -> None:
-    without = replace(variant, views=tuple(v for v in variant.views if v.split != "original"))
-    assert dataset.load(without).scene_scale == dataset.load(variant).scene_scale
-    assert torch.equal(dataset.load(without).points, dataset.load(variant).points)
-
-
 def test_a_use_without_views_is_refused(variant: Variant) -> None:
     without = replace(variant, views=tuple(v for v in variant.views if v.split != "original"))
     with pytest.raises(XrgsError, match="no original of v2"):
         dataset.load(without, "all_hr")
     high = replace(variant, views=tuple(v for v in without.views if v.tag == "HR"))
     assert [v.name for v in dataset.load(high, "all_hr").train] == ["v1"]
-    with pytest.raises(
-        XrgsError, match=r"train\.views=lr_only: variant id has no LR training view"
-    ):
+    with pytest.raises(XrgsError, match=r"views=lr_only: variant id has no LR training view"):
         dataset.load(high, "lr_only")
-    low = replace(without, views=tuple(v for v in without.views if v.name != "v1"))
-    with pytest.raises(
-        XrgsError, match=r"train\.views=hr_only: variant id has no HR training view"
-    ):
-        dataset.load(low, "hr_only")
-    with pytest.raises(
-        XrgsError, match=r"train\.views=best: must be one of mixed, all_hr, hr_only, lr_only"
-    ):
+    with pytest.raises(XrgsError, match=r"views=best: must be one of mixed, all_hr, hr_only, lr"):
         dataset.load(variant, "best")
 
 
@@ -139,20 +123,16 @@ def test_an_image_of_another_size_than_the_list_says_is_named(variant: Variant) 
         dataset.load(replace(variant, views=views))
 
 
-@pytest.mark.parametrize("of", ["points", "cameras", "nothing"])
+@pytest.mark.parametrize("of", ["points", "cameras"])
 def test_a_world_that_cant_be_normalised_is_one_line(variant: Variant, of: str) -> None:
-    """Points beyond float64's range, cameras whose up axes cancel out, and no camera at all."""
+    """Points beyond float64's range, and cameras whose up axes cancel out."""
     points, views = variant.points, variant.views
     if of == "points":
         points = np.full((5, 3), 1e300) * np.arange(5)[:, None]
-    elif of == "cameras":
-        half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
-        upright = (replace(v, viewmat=np.eye(4)) for v in views if v.split != "original")
-        views = tuple(
-            replace(v, viewmat=half_turn) if i % 2 else v for i, v in enumerate([*upright][:4])
-        )
     else:
-        views = ()
+        turns = [np.eye(4), np.diag([-1.0, -1.0, 1.0, 1.0])] * 2
+        upright = [v for v in views if v.split != "original"]
+        views = tuple(replace(v, viewmat=t) for v, t in zip(upright, turns, strict=False))
     with pytest.raises(XrgsError, match="its cameras and points can't be of one scene"):
         dataset.load(replace(variant, points=points, views=views))
 
@@ -168,7 +148,7 @@ def names(views: tuple[LoadedView, ...]) -> list[str]:
     return [view.name for view in views]
 
 
-@pytest.mark.parametrize(("share", "count"), [(0.01, 1), (0.1, 1), (0.25, 2), (0.5, 4), (0.75, 6)])
+@pytest.mark.parametrize(("share", "count"), [(0.01, 1), (0.25, 2), (0.75, 6)])
 def test_a_share_of_the_hr_training_views_is_scored_and_not_trained_on(
     many: Variant, share: float, count: int
 ) -> None:
@@ -195,7 +175,7 @@ def test_every_control_of_a_seed_holds_out_the_same_views(many: Variant) -> None
     assert names(dataset.load(many, "lr_only", validation=0.25).train) == ["v2", "v3", "v4"]
 
 
-@pytest.mark.parametrize(("share", "folds"), [(0.125, 8), (0.25, 4), (0.5, 2)])
+@pytest.mark.parametrize(("share", "folds"), [(0.125, 8), (0.5, 2)])
 def test_the_seeds_hold_out_each_hr_view_once(many: Variant, share: float, folds: int) -> None:
     held_out = [
         names(dataset.load(many, validation=share, seed=seed).test) for seed in range(folds)

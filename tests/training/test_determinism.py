@@ -78,8 +78,8 @@ def hashes(*threads: int, **environment: str) -> list[tuple[str, str]]:
 
 @pytest.mark.slow
 def test_the_number_of_threads_changes_no_bit_and_they_are_the_held_ones() -> None:
-    found = hashes(1, 2, 3)
-    assert [strategy for strategy, _ in found] == [name for name in HELD for _ in range(3)]
+    found = hashes(2, 3)  # the test below has one
+    assert [strategy for strategy, _ in found] == [name for name in HELD for _ in range(2)]
     assert len(set(found)) == len(HELD)
     if native.fused_multiply_add():
         assert dict(found) == HELD, UPDATE

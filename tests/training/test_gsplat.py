@@ -6,7 +6,6 @@ GPU's rules for the GPU (`tests/fake_gpu.py`).
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -16,42 +15,35 @@ import torch
 from tests.conftest import composed as compose
 from tests.fake_gpu import DEVICE, fake_gpu
 from tests.gsplat_stand_in import ALPHA_MAX, stand_in
-from tests.training.conftest import comparable
-from tests.training.test_loop import ABLATIONS
+from tests.training.conftest import comparable, masked
 from xrgs.config import Conf
 from xrgs.evaluation import protocol
 from xrgs.splat.gaussians import PARAMETERS
 from xrgs.splat.loss import photometric_loss
 from xrgs.training import loop
 from xrgs.training.checkpoint import Checkpoint
+from xrgs.training.components import Step
 from xrgs.training.dataset import Dataset
 from xrgs.training.loop import train
 from xrgs.training.memory import TrainingMemory
 
 pytest.importorskip("xrgs._native", reason="the kernels were not built")
 
-#: Settings without which an ablation does nothing in so few steps on so few Gaussians.
-WITH = {
-    "exposure_gain": ["components.exposure.mode=gain"],
-    "mcmc": ["splat.densify.budget=0.03"],
-    "near_limit": ["components.floaters.near_share=1"],
-    "natural_selection": [
+#: Trainings on the GPU that have every component and strategy between them.
+TRAININGS = {
+    "plus": (
+        "+ablation=[plus,exposure,region_weighting,continuous_weighting,densify_own_threshold]",
+        "splat.densify.budget=0.22",
+        "components.floaters.near_share=1",
         "components.natural_selection.budget=0.003",
         "splat.densify.stop=10000",
-    ],
-    "count_matched": [
-        "components.count_matched.gaussians=40",
-        "components.count_matched.tolerance=1000",
-    ],
-}
-#: The ablations that have most of the components between them; the others are marked slow.
-FAST = ("xrgs", "plus", "mcmc", "exposure", "region_weighting", "natural_selection")
-#: Those whose parts, on the GPU, are those of others in these tests.
-COVERED = {
-    *("absgrad", "antialiased", "consistency", "dense", "densify", "fast", "fitted_rates"),
-    *("formation", "gradient_scaling", "harmonics_every", "hr_share", "keep_large", "lean"),
-    *("loss_gradient", "loss_weighting", "no_resets", "resolution_schedule", "supersampled"),
-    *("tuned_baseline", "xrgs_own_threshold", "xrgs_per_class"),
+    ),
+    "xrgs": (
+        "+ablation=[xrgs_per_class,curriculum,adaptive_weighting,hybrid_schedule,render_scale,mip]",
+        "components.exposure.mode=gain",
+        "splat.densify.split=long_axis",
+    ),
+    "mcmc": ("+ablation=mcmc", "splat.densify.budget=0.03"),
 }
 
 
@@ -59,7 +51,7 @@ def config(ablation: str, *changes: str, backend: str = "gsplat") -> Conf:
     return compose(f"+ablation={ablation}", f"splat.backend={backend}", ALPHA_MAX, *changes)
 
 
-@pytest.mark.parametrize("ablation", ["baseline", "xrgs", "plus"])
+@pytest.mark.parametrize("ablation", ["xrgs", "plus"])
 def test_fifty_steps_are_those_of_the_native_backend(data: Dataset, ablation: str) -> None:
     # The first Gaussians are round, and the gradients of their rotations are rounding only. With
     # gsplat's eps of 1e-15, Adam would make whole steps of it. Rates that fit 50 steps are 24 times
@@ -83,28 +75,14 @@ def test_fifty_steps_are_those_of_the_native_backend(data: Dataset, ablation: st
         }
 
 
-def masked(data: Dataset) -> Dataset:
-    """The dataset with a third of every photograph outside a mask."""
-    views = []
-    for view in data.train:
-        mask = torch.ones(view.camera.height, view.camera.width, dtype=torch.bool)
-        mask[: len(mask) // 3] = False
-        views.append(dataclasses.replace(view, mask=mask))
-    return dataclasses.replace(data, train=tuple(views))
-
-
-@pytest.mark.parametrize(
-    "ablation",
-    [
-        name if name in FAST else pytest.param(name, marks=pytest.mark.slow)
-        for name in ABLATIONS
-        if name not in COVERED
-    ],
-)
-def test_training_leaves_no_tensor_on_the_processor(data: Dataset, ablation: str) -> None:
-    changes = ("train.steps=12", "splat.densify.every=5000", *WITH.get(ablation, []))
+@pytest.mark.parametrize("training", TRAININGS)
+def test_training_leaves_no_tensor_on_the_processor(data: Dataset, training: str) -> None:
+    conf = compose(
+        *("splat.backend=gsplat", ALPHA_MAX, "train.steps=8", "splat.densify.every=7500"),
+        *TRAININGS[training],
+    )
     with stand_in(DEVICE.type), fake_gpu():
-        result = train(masked(data), config(ablation, *changes))
+        result = train(masked(data), conf)
     assert {result.gaussians[name].device.type for name in PARAMETERS} == {"cpu"}
     assert all(torch.isfinite(result.gaussians[name]).all() for name in PARAMETERS)
 
@@ -113,15 +91,15 @@ class Kill(BaseException):
     """Ends a run as a kill does."""
 
 
-@pytest.mark.parametrize("ablation", ["plus", pytest.param("xrgs", marks=pytest.mark.slow)])
 def test_a_killed_run_continues(
-    data: Dataset, ablation: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    conf, calls = config(ablation, "train.steps=12", "splat.densify.every=7500"), [0]
+    conf, calls = config("mip", "train.steps=8", "splat.densify.every=7500"), [0]
+    conf.components.exposure.mode = "affine"
 
     def mortal(*arguments: Any, **named: Any) -> Any:
         calls[0] += 1
-        if calls[0] == 18:
+        if calls[0] == 13:
             raise Kill
         return photometric_loss(*arguments, **named)
 
@@ -134,7 +112,7 @@ def test_a_killed_run_continues(
         with pytest.raises(Kill):
             train(data, conf, checkpoint())
         continued = checkpoint()
-        assert continued.load() == 5
+        assert continued.load() == 4
         again = train(data, conf, continued)
     assert comparable(again) == comparable(whole)
 
@@ -153,18 +131,18 @@ def test_evaluation_renders_on_the_gpu_and_scores_on_the_processor(
     assert (tmp_path / "renders" / "v0.png").stat().st_size
 
 
-def test_memory_of_a_gpu_is_what_torch_has_allocated(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_of_a_gpu_is_what_torch_has_allocated(
+    data: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
     peak = [7]
     monkeypatch.setattr(torch.cuda, "reset_peak_memory_stats", lambda: peak.__setitem__(0, 0))
     monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda: peak[0])
     memory = TrainingMemory(device="cuda")
     assert peak == [0]
-    step: Any = dataclasses.make_dataclass("Step", ["view", "log"])
-    view: Any = dataclasses.make_dataclass("View", ["camera", "tag"])
-    camera: Any = dataclasses.make_dataclass("Camera", ["width", "height"])
+    step = Step(0, 1, data.train[0])
     # The hooks would hide the tensor on which gsplat 1.5.3 stores `absgrad`.
     saved = torch.ones(3, requires_grad=True)
-    with memory.of_forward(step(view(camera(4, 4), "HR"), {}), 3, 0):
+    with memory.of_forward(step, 3, 0):
         product = saved * saved
     assert product.grad_fn is not None
     assert product.grad_fn._saved_self is saved  # type: ignore[attr-defined]

@@ -16,33 +16,38 @@ from omegaconf import OmegaConf
 
 from tests.conftest import composed as compose
 from tests.conftest import ramps
-from tests.training.conftest import same
+from tests.training.conftest import masked, same
 from xrgs.config import CONF_DIR, Conf
 from xrgs.errors import XrgsError
 from xrgs.splat.gaussians import ActivatedGaussians, Gaussians, from_points
 from xrgs.splat.loss import photometric_loss, prepare_target
 from xrgs.splat.optimizer import SplatOptimizer
-from xrgs.splat.rendering import Render, rasterize_parameters
+from xrgs.splat.rendering import rasterize_parameters
 from xrgs.splat.settings import DensifySettings, OptimizerSettings, RasterSettings
 from xrgs.splat.strategy.default import DefaultStrategy
-from xrgs.training import components, recorder, rendering
+from xrgs.training import components, recorder
+from xrgs.training.checkpoint import Checkpoint
 from xrgs.training.components import Step, base
 from xrgs.training.count_matching import train_cell
 from xrgs.training.dataset import USES, Dataset
 from xrgs.training.loop import train
+from xrgs.training.recorder import TrainingResult
 from xrgs.training.sampler import EpochSampler
 from xrgs.training.seeding import seeded_generator
 
-#: Every file of `conf/ablation` that changes how training goes, not what is trained on.
+#: Ablations that do only what others do, or change no more than what others weigh. A dense start
+#: is off by itself on views of 12 px; tests/training/dense has its scenes.
+COVERED = {
+    *("baseline", "dense", "fast", "lean", "plus", "tuned_baseline"),
+    *("xrgs", "xrgs_own_threshold", "xrgs_per_class", "densify_per_class", "exposure_gain"),
+    *("adaptive_weighting", "continuous_weighting", "hybrid_schedule", "loss_weighting"),
+}
+#: Every other file of `conf/ablation` that changes how training goes, not what is trained on.
 ABLATIONS = sorted(
-    {path.stem for path in (CONF_DIR / "ablation").glob("*.yaml")} - {"baseline"} - set(USES)
+    {path.stem for path in (CONF_DIR / "ablation").glob("*.yaml")} - COVERED - set(USES)
 )
-
-
 #: The ablations that `plus` is made of.
 IN_PLUS = set(OmegaConf.load(CONF_DIR / "ablation" / "plus.yaml").defaults)
-#: The ablations that `plus` refuses, and the key that the message begins with.
-NOT_WITH_PLUS = {"mcmc": "splat.raster.absgrad"}
 
 
 @pytest.mark.parametrize("backend", ["torch", "native"])
@@ -116,12 +121,6 @@ def test_training_lowers_the_loss(data: Dataset, short: Conf) -> None:
     assert sum(losses[-8:]) < 0.5 * sum(losses[:8])
 
 
-def test_components_that_change_nothing_change_no_bit(data: Dataset, short: Conf) -> None:
-    plain = train(data, short)
-    idle = train(data, short, extra_components=[components.Component()])
-    assert same(plain.gaussians, idle.gaussians)
-
-
 class HookRecorder(components.Component):
     """Asserts what hooks are called with, and bakes black Gaussians."""
 
@@ -160,14 +159,6 @@ class HookRecorder(components.Component):
 
     def after_training(self, gaussians: Gaussians) -> None:
         assert (gaussians.sh0 == 0).all()
-
-
-def test_hooks_see_the_gaussians_of_the_step(data: Dataset, short: Conf) -> None:
-    recorder = HookRecorder()
-    result = train(data, short, extra_components=[recorder])
-    # The hook was called after every refinement, or the sizes would not agree.
-    assert len(set(recorder.sizes)) > 3
-    assert (result.gaussians.sh0 == 0).all()  # the result is what `bake` made of the Gaussians
 
 
 class CallRecorder(components.Component):
@@ -211,35 +202,16 @@ def test_hooks_are_called_in_the_documented_order(data: Dataset) -> None:
     assert names[begin:-2] == documented
 
 
-def test_evaluation_changes_no_bit_and_sees_what_would_be_saved(data: Dataset, short: Conf) -> None:
-    short.train.evaluate_every = 10
-    seen: list[int] = []
-
-    def evaluate(gaussians: Gaussians) -> dict[str, float | None]:
-        seen.append(len(gaussians))
-        assert (gaussians.sh0 == 0).all()  # `bake` was called
-        gaussians.means.fill_(torch.nan)  # a copy: training does not notice
-        return {"psnr": float(len(seen)), "lpips": None}
-
-    result = train(data, short, extra_components=[HookRecorder()], evaluate=evaluate)
-    plain = train(data, short, extra_components=[HookRecorder()])
-    assert same(result.gaussians, plain.gaussians)
-    assert plain.scores == []
-    assert [row["step"] for row in result.scores] == [10, 20, 30]  # not the last of 40
-    assert [row["gaussians"] for row in result.scores] == seen
-    assert [(row["psnr"], row["lpips"]) for row in result.scores] == [
-        (1, None),
-        (2, None),
-        (3, None),
-    ]
-    work = [row["evaluations"] for row in result.scores]
-    assert 0 < work[0] < work[1] < work[2] < result.evaluations
-
-
-def test_the_time_of_an_evaluation_is_no_training_time(
+def test_evaluation_changes_no_bit_takes_no_time_and_sees_what_would_be_saved(
     data: Dataset, short: Conf, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    now = [0.0]
+    """Hooks see the Gaussians of the step, with an evaluation or without one."""
+    hooks = HookRecorder()
+    plain = train(data, short, extra_components=[hooks])
+    # The hook was called after every refinement, or the sizes would not agree.
+    assert len(set(hooks.sizes)) > 3
+    assert (plain.gaussians.sh0 == 0).all()  # the result is what `bake` made of the Gaussians
+    now, seen = [0.0], list[int]()
     monkeypatch.setattr(recorder, "time", SimpleNamespace(perf_counter=lambda: now[0]))
     short.train.evaluate_every = 10
 
@@ -249,36 +221,27 @@ def test_the_time_of_an_evaluation_is_no_training_time(
 
     def evaluate(gaussians: Gaussians) -> dict[str, float | None]:
         now[0] += 1000.0
-        return {}
+        seen.append(len(gaussians))
+        assert (gaussians.sh0 == 0).all()  # `bake` was called
+        gaussians.means.fill_(torch.nan)  # a copy: training does not notice
+        return {"psnr": float(len(seen)), "lpips": None}
 
-    result = train(data, short, extra_components=[Clock()], evaluate=evaluate)
-    assert [row["seconds"] for row in result.scores] == [10.0, 20.0, 30.0]
-    assert result.seconds == 40.0
+    class Written(Checkpoint):
+        def save_if_due(self, step: int) -> float:
+            now[0] += 100.0
+            return 100.0
 
-
-def test_extra_components_run_behind_those_of_the_config(data: Dataset, short: Conf) -> None:
-    class Doubling(components.Component):
-        def modify_loss(
-            self, loss: torch.Tensor, image: torch.Tensor, gaussians: Gaussians, step: Step
-        ) -> torch.Tensor:
-            step.log["loss.before"] = loss.item()
-            return 2 * loss
-
-    short.train.steps = 4
-    short.components.loss_weighting.lr_weight = 0.25
-    first = train(data, short, extra_components=[Doubling()]).history
-    assert [row["loss"] for row in first] == [2 * row["loss.before"] for row in first]
-    plain = train(data, short).history
-    assert first[0]["loss.before"] == plain[0]["loss"]
-
-
-def test_a_gradient_of_zero_grows_nothing(data: Dataset, short: Conf) -> None:
-    class Zero(components.Component):
-        def densification_grad2d(self, gradient: torch.Tensor, step: Step) -> torch.Tensor:
-            return torch.zeros_like(gradient)
-
-    last = train(data, short, extra_components=[Zero()]).history[-1]
-    assert last["duplicated"] == last["split"] == 0
+    result = train(data, short, Written(), [HookRecorder(), Clock()], evaluate)
+    assert same(result.gaussians, plain.gaussians)
+    assert plain.scores == []
+    columns = ("step", "seconds", "gaussians", "psnr", "lpips")
+    assert [tuple(row[name] for name in columns) for row in result.scores] == [
+        (step, step, count, number, None)  # not after the last step, 40
+        for number, (step, count) in enumerate(zip((10, 20, 30), seen, strict=True), 1)
+    ]
+    assert result.seconds == 40.0  # nor is the time of writing a checkpoint
+    work = [row["evaluations"] for row in result.scores]
+    assert 0 < work[0] < work[1] < work[2] < result.evaluations
 
 
 class Choosing(components.Component):
@@ -304,26 +267,18 @@ class Choosing(components.Component):
         return torch.arange(len(gaussians)) >= len(gaussians) - 3
 
 
-def test_components_restrict_what_grows(data: Dataset) -> None:
+def test_components_choose_what_grows_and_what_goes_at_any_step(data: Dataset) -> None:
     conf = compose("train.steps=30", "splat.densify.every=5000", "splat.densify.grow_grad2d=0")
     conf.splat.densify.start, conf.splat.densify.stop = 0, 6000  # one refinement, at step 5
-    chosen = Choosing()
-    last = train(data, conf, extra_components=[chosen]).history[-1]
-    assert chosen.asked == [5]
-    assert last["duplicated"] + last["split"] == 30  # of 60, all of them above the threshold
-
-
-def test_components_remove_gaussians_at_any_step(data: Dataset, short: Conf) -> None:
-    short.splat.densify.stop = 15_000  # step 20 of 40
-    result = train(data, short, extra_components=[Choosing(prune_at=(7, 10, 33))])
+    conf.splat.densify.reset_every = 50_000  # never; large Gaussians would go after it
+    choosing = Choosing(prune_at=(7, 10, 23))
+    result = train(data, conf, extra_components=[choosing])
     last = result.history[-1]
-    grown = last["duplicated"] + last["split"]
-    pruned = [row["pruned_by_components"] for row in result.history]
-    rules = last["pruned_opacity"] + last["pruned_scale"] + last["pruned_non_finite"]
+    assert choosing.asked == [5]
+    assert last["duplicated"] + last["split"] == 30  # of 60, all of them above the threshold
     assert next(row["step"] for row in result.history if row["pruned_by_components"] == 6) == 11
-    assert pruned[0] == 0
-    assert pruned[-1] == 9
-    assert len(result.gaussians) == 60 + grown - rules - 9 == last["gaussians"]
+    rules = last["pruned_opacity"] + last["pruned_scale"] + last["pruned_non_finite"]
+    assert len(result.gaussians) == 60 + 30 - rules - 9 == last["gaussians"]
 
 
 def test_the_budget_counts_by_pixels_of_the_largest_view(data: Dataset) -> None:
@@ -355,8 +310,7 @@ def plain() -> Gaussians:
 
 
 @pytest.mark.slow
-# A dense start is off by itself on views of 12 px; tests/training/dense has its scenes.
-@pytest.mark.parametrize("ablation", [name for name in ABLATIONS if name != "dense"])
+@pytest.mark.parametrize("ablation", ABLATIONS)
 def test_each_ablation_changes_the_result(data: Dataset, plain: Gaussians, ablation: str) -> None:
     conf = compose(*SHORT, f"+ablation={ablation}", *ACTS_HERE.get(ablation, ()))
     if conf.matched_to is not None:  # as a sweep does
@@ -364,57 +318,44 @@ def test_each_ablation_changes_the_result(data: Dataset, plain: Gaussians, ablat
     assert not same(plain, train_cell(data, conf).gaussians)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("ablation", sorted({*ABLATIONS} - {*NOT_WITH_PLUS} - IN_PLUS))
-def test_each_ablation_trains_with_plus_exposure_and_masks(data: Dataset, ablation: str) -> None:
-    """Its 20 steps go through densification, selection and the late factor of `supersampled`."""
-    conf = compose("train.steps=20", "splat.backend=auto", f"+ablation=[plus,exposure,{ablation}]")
-    masked = [
-        dataclasses.replace(
-            view, mask=(torch.arange(view.image.shape[1]) > 3).repeat(len(view.image), 1)
-        )
-        for view in data.train
-    ]
-    result = train(dataclasses.replace(data, train=tuple(masked)), conf)
+def test_every_ablation_trains_with_plus_exposure_and_masks(data: Dataset) -> None:
+    """Their 20 steps go through densification, selection and the late factor of `supersampled`."""
+    others = ",".join(sorted({*ABLATIONS} - IN_PLUS - {"mcmc", "count_matched", "exposure_gain"}))
+    conf = compose(*SHORT, f"+ablation=[plus,{others},xrgs_per_class,hybrid_schedule]")
+    result = train(masked(data), conf)
     assert all(math.isfinite(row["loss"]) for row in result.history)
     assert len({row["exposure.gain"] for row in result.history}) > 1
 
 
-class Counter(components.Component):
-    """Answers that no backward pass is needed at some steps, and counts the calls of the hooks."""
+class Skipping(CallRecorder):
+    """Answers that no backward pass is needed at some steps, and removes no Gaussian."""
 
-    def __init__(self, skipped: set[int]) -> None:
+    def __init__(self, *skipped: int) -> None:
+        super().__init__()
         self.skipped = skipped
-        self.calls: dict[str, list[int]] = {"asked": [], "backward": [], "densify": []}
 
     def needs_backward(self, loss: torch.Tensor, step: Step) -> bool:
-        assert loss.ndim == 0
-        self.calls["asked"].append(step.number)
-        return step.number not in self.skipped
+        return super().needs_backward(loss, step) and step.number not in self.skipped
 
-    def after_backward(self, gaussians: Gaussians, step: Step) -> None:
-        assert gaussians.means.grad is not None
-        self.calls["backward"].append(step.number)
+    def to_prune(self, gaussians: Gaussians, step: Step) -> None:  # type: ignore[override]
+        return None
 
-    def densification_grad2d(self, grad2d: torch.Tensor, step: Step) -> torch.Tensor:
-        self.calls["densify"].append(step.number)
-        return grad2d
+    def steps_of(self, hook: str) -> list[int | None]:
+        return [number for name, number in self.calls if name == hook]
 
 
 def test_a_skipped_step_has_no_update_and_every_component_is_asked(
-    data: Dataset, short: Conf
+    data: Dataset, short: Conf, trained: TrainingResult
 ) -> None:
-    first, second = Counter({3, 4}), Counter({4, 7})
+    first, second = Skipping(3, 4), Skipping(4, 7)
     result = train(data, short, extra_components=[first, second])
-    done = [step for step in range(short.train.steps) if step not in {3, 4, 7}]
-    assert first.calls["asked"] == second.calls["asked"] == list(range(short.train.steps))
-    assert first.calls["backward"] == first.calls["densify"] == done
+    for hooks in (first, second):
+        assert hooks.steps_of("needs_backward") == list(range(40))
+        done = [step for step in range(40) if step not in {3, 4, 7}]
+        assert hooks.steps_of("after_backward") == hooks.steps_of("densification_grad2d") == done
     totals = [row["skipped_backward"] for row in result.history[:9]]
     assert totals == [0, 0, 0, 1, 2, 2, 2, 3, 3]
-
-
-def test_without_a_skipped_step_the_history_has_no_such_column(data: Dataset, short: Conf) -> None:
-    assert "skipped_backward" not in train(data, short).history[-1]
+    assert "skipped_backward" not in trained.history[-1]
 
 
 def test_the_last_steps_can_be_left_out(data: Dataset, short: Conf) -> None:
@@ -426,41 +367,32 @@ def test_the_last_steps_can_be_left_out(data: Dataset, short: Conf) -> None:
         return {}
 
     short.splat.densify.stop, short.train.evaluate_every = 0, 20
-    result = train(data, short, extra_components=[Counter(set(range(20, 40)))], evaluate=look)
+    result = train(data, short, extra_components=[Skipping(*range(20, 40))], evaluate=look)
     assert same(result.gaussians, seen[0])
     assert not same(train(data, short).gaussians, seen[0])
 
 
-@pytest.mark.parametrize(("ablation", "key"), NOT_WITH_PLUS.items())
-def test_what_does_not_go_with_plus_names_the_key(ablation: str, key: str) -> None:
-    with pytest.raises(XrgsError, match=f"^{re.escape(key)}="):
-        compose(f"+ablation=[plus,{ablation}]")
+def test_what_does_not_go_with_plus_names_the_key() -> None:
+    with pytest.raises(XrgsError, match=r"^splat\.raster\.absgrad="):
+        compose("+ablation=[plus,mcmc]")
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        ["+ablation=loss_gradient", "components.loss_weighting.stat_from=unweighted"],
-        ["+ablation=densify", "components.densify.lr_prune=1"],
-        [
-            "+ablation=densify",
-            "components.densify.decide=current_view",
-            "components.densify.lr_prune=1",
-        ],
-        ["+ablation=render_scale"],
-    ],
-    ids=["loss_gradient", "per_class", "current_view", "render_scale"],
-)
+@pytest.mark.parametrize("decide", ["per_class", "current_view"])
 def test_what_changes_lr_views_alone_does_not_change_training_on_hr_views(
-    data: Dataset, changes: list[str]
+    data: Dataset, plain: Gaussians, decide: str
 ) -> None:
     # With lr_prune at 1: another value raises the reset opacity and prunes Gaussians that no HR
     # view shows.
     views = tuple(view for view in data.train if view.tag == "HR")
     data = dataclasses.replace(data, train=views)
-    overrides = ["train.steps=20", "splat.backend=auto"]
-    plain = train(data, compose(*overrides))
-    assert same(plain.gaussians, train(data, compose(*overrides, *changes)).gaussians)
+    changes = (
+        "+ablation=[loss_gradient,densify,render_scale]",
+        "components.loss_weighting.stat_from=unweighted",
+        f"components.densify.decide={decide}",
+        "components.densify.lr_prune=1",
+    )
+    found = train(data, compose(*SHORT, *changes)).gaussians
+    assert same(train(data, compose(*SHORT)).gaussians, found)
 
 
 def test_training_continues_when_every_gaussian_is_pruned(data: Dataset, short: Conf) -> None:
@@ -468,18 +400,3 @@ def test_training_continues_when_every_gaussian_is_pruned(data: Dataset, short: 
     result = train(data, short)
     assert len(result.gaussians) == 0
     assert result.history[-1]["step"] == short.train.steps - 1
-
-
-def test_the_sh_bands_are_switched_on_in_turn(
-    data: Dataset, short: Conf, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    degrees = []
-
-    def spy(*arguments: Any, sh_degree: int, **others: Any) -> Render:
-        degrees.append(sh_degree)
-        return rasterize_parameters(*arguments, sh_degree=sh_degree, **others)
-
-    monkeypatch.setattr(rendering, "rasterize_parameters", spy)
-    short.train.steps = 60
-    train(data, short)
-    assert degrees == [min(step // 2, 3) for step in range(60)]

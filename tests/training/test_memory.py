@@ -10,7 +10,6 @@ import torch
 
 from tests.conftest import composed
 from tests.training.conftest import same
-from xrgs.config import Conf
 from xrgs.splat.gaussians import PARAMETERS
 from xrgs.splat.rendering import Render
 from xrgs.training import memory
@@ -18,6 +17,7 @@ from xrgs.training.components import Step, TrainingView
 from xrgs.training.dataset import Dataset
 from xrgs.training.loop import train
 from xrgs.training.memory import OnDemand, TrainingMemory, tensors_in
+from xrgs.training.recorder import TrainingResult
 
 
 @dataclass
@@ -54,28 +54,18 @@ def test_tensors_that_share_memory_count_once_and_buffers_are_added(data: Datase
     assert counted.largest_bytes == 400 + 40 + 1000
 
 
-def test_what_autograd_saves_counts(data: Dataset) -> None:
+def test_what_autograd_saves_counts_and_what_a_forward_pass_drops_does_not(data: Dataset) -> None:
+    """Or a count would depend on which of its addresses are used again."""
     x = torch.rand(50, requires_grad=True)
     counted = TrainingMemory(x)
     with counted.of_forward(step(data), 1, 0):
+        (x.exp() * x.cos()).sum()  # dropped
         y = x.exp()  # saves its result
         z = y * 2.0 + 1  # saves nothing
         loss = (z * z).sum()  # saves z
     torch.autograd.backward(loss)
     counted.record(render(0))
     assert counted.largest_bytes == 4 * 50 * (1 + 1 + 2)  # x, its gradient; y and z
-
-
-def test_what_a_forward_pass_drops_does_not_count(data: Dataset) -> None:
-    """Or a count would depend on which of its addresses are used again."""
-    x = torch.rand(50, requires_grad=True)
-    counted = TrainingMemory(x)
-    with counted.of_forward(step(data), 1, 0):
-        (x.exp() * x.cos()).sum()
-        loss = x.exp().sum()
-    torch.autograd.backward(loss)
-    counted.record(render(0))
-    assert counted.largest_bytes == 4 * 50 * (1 + 1 + 1)  # x, its gradient, one exponential
 
 
 def test_steps_alike_are_counted_once_until_the_gaussians_change(data: Dataset) -> None:
@@ -107,13 +97,6 @@ def test_a_step_without_backward_does_not_stand_for_its_kind(data: Dataset) -> N
     assert counted.largest_bytes == 400
 
 
-def test_training_counts_model_photographs_and_loss(data: Dataset, short: Conf) -> None:
-    result = train(data, short)
-    model = sum(result.gaussians[name].nbytes for name in PARAMETERS)
-    photographs = sum(view.pixels.nbytes for view in (*data.train, *data.test))
-    assert result.memory_bytes > 4 * model + photographs  # gradients and two moments
-
-
 def test_values_are_kept_as_far_as_the_bytes_go(
     data: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -136,22 +119,20 @@ def test_values_are_kept_as_far_as_the_bytes_go(
     ]
 
 
-@pytest.mark.parametrize(
-    "ablation", ["baseline", "consistency", "region_weighting", "resolution_schedule"]
-)
 def test_what_is_not_kept_changes_no_bit_and_takes_less_memory(
-    data: Dataset, monkeypatch: pytest.MonkeyPatch, ablation: str
+    data: Dataset, monkeypatch: pytest.MonkeyPatch, trained: TrainingResult
 ) -> None:
-    conf = composed("train.steps=20", "splat.backend=auto", f"+ablation={ablation}")
+    """And what components hold counts."""
+    holding = "+ablation=[consistency,region_weighting,resolution_schedule]"
+    conf = composed("train.steps=40", "splat.backend=auto", holding)
     kept = train(data, conf)
     monkeypatch.setattr(memory, "KEPT_BYTES", 0)
     anew = train(data, conf)
     assert same(kept.gaussians, anew.gaussians)
     assert kept.history == anew.history
-    assert anew.memory_bytes < kept.memory_bytes
-
-
-def test_a_component_that_holds_more_counts_more(data: Dataset, short: Conf) -> None:
-    plain = train(data, short).memory_bytes
-    short.components.consistency.weight = 0.1
-    assert train(data, short).memory_bytes > plain
+    # More than the mean and variance of each photograph: what components keep counts too.
+    moments = sum(2 * 4 * view.image.numel() for view in data.train)
+    assert kept.memory_bytes - anew.memory_bytes > moments
+    model = sum(trained.gaussians[name].nbytes for name in PARAMETERS)
+    photographs = sum(view.pixels.nbytes for view in (*data.train, *data.test))
+    assert trained.memory_bytes > 4 * model + photographs  # gradients and two moments

@@ -15,12 +15,7 @@ if TYPE_CHECKING:
 
 
 def score_file(render: Path, view: View, *, masked: bool) -> dict[str, float | None]:
-    """Score a render, an 8-bit RGB PNG, against the photograph of a view.
-
-    Args:
-        render: The file, of the view's size.
-        view: The view.
-        masked: Whether any of the scored views has a mask (`xrgs.evaluation.metrics.score_view`).
+    """Score a render, an 8-bit RGB PNG of the view's size, by `xrgs.evaluation.metrics.score_view`.
 
     Raises:
         ImageError: A file is missing, damaged or of another size or mode; the message names it.

@@ -58,12 +58,7 @@ def score_views(
 def mean_scores(
     gaussians: Gaussians, views: Sequence[LoadedView], conf: SplatConf
 ) -> dict[str, float | None]:
-    """Score each view as `score_views` does, without writing renders.
-
-    Args:
-        gaussians: The model as it would be saved.
-        views: The test views, at full size; at least one.
-        conf: Settings of the model; those of the rasterizer and the backend are read.
+    """Score each view, at least one, as `score_views` does, without writing renders.
 
     Returns:
         Metric name -> mean over the views; None if it is not available.
@@ -83,12 +78,8 @@ def render_time(gaussians: Gaussians, views: Sequence[LoadedView], conf: SplatCo
 
     Each view is rendered once to warm up and then timed, with torch's present number of threads, on
     the GPU if the backend is gsplat. The time is that from the model's parameters to the image, as
-    in gsplat's trainer [ye2025]; the median over the views is our choice.
-
-    Args:
-        gaussians: The trained model.
-        views: The test views, at full size; at least one.
-        conf: Settings of the model; those of the rasterizer and the backend are read.
+    in gsplat's trainer [ye2025]; the median over the views, at least one, is our choice. Arguments
+    as for `score_views`.
 
     Returns:
         The median over the views, ms.

@@ -1,8 +1,8 @@
 """Tables of the work of each training, the work that it skipped, and the cost of the skipped work.
 
 They show why a component changes nothing or makes results worse, and where a run saves time. Counts
-come from the history of a cell; the totals of `xrgs.training.work.StepWork` and the seconds of each
-stage from its summary. The cost of skipped work is estimated from the same run's totals.
+come from the history of a cell; the totals (`xrgs.training.recorder`) and the seconds of each stage
+from its summary. The cost of skipped work is estimated from the same run's totals.
 """
 
 from __future__ import annotations

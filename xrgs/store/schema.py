@@ -78,7 +78,7 @@ class Summary(Struct, frozen=True):
     grow_grad2d: Number | None = None
     """The growth threshold of densification, which count matching searches for."""
     work: dict[str, Number] = {}
-    """Sums of the work that the steps did and left out, see `xrgs.training.work`."""
+    """Sums of the work that the steps did and left out (`xrgs.training.recorder`)."""
     stage_seconds: dict[str, Number] = {}
     found: tuple[str, ...] = ()
     """What components found out about the photographs, for example `formation: LR views: ...`."""

@@ -21,7 +21,6 @@ from xrgs.safeio import npz
 from xrgs.safeio.atomic import atomic_writer
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -48,9 +47,6 @@ class Stateful(Protocol):
     def load_state_dict(self, state: State) -> None:
         """Restore the state of an object that was built from the same config and data.
 
-        Args:
-            state: The result of `state_dict`.
-
         Raises:
             KeyError: An entry is missing.
             TypeError: An entry is of another type.
@@ -62,26 +58,20 @@ class Checkpoint:
     """Writes the state of the registered objects to a file at an interval, and restores it."""
 
     def __init__(self, file: Path | None = None, cell_id: str = "", every_s: float = 0.0) -> None:
-        """Set the file and the interval.
+        """Set the file of the cell in training, and the seconds between two writes.
 
-        Args:
-            file: The checkpoint file; None writes nothing.
-            cell_id: Id of the cell in training. The file of another cell is refused.
-            every_s: Seconds between two writes; 0 never writes.
+        None as file and 0 seconds write nothing. The file of another cell is refused.
         """
-        self.file = file
-        self.cell_id = cell_id
-        self.every_s = every_s
+        self.file, self.cell_id, self.every_s = file, cell_id, every_s
         self._objects: dict[str, Stateful] = {}
         self._loaded: State = {}
         """States that `load` has read, of objects that are not registered yet."""
         self._written_at = time.monotonic()
 
     def load(self) -> int | None:
-        """Read the file; each object's state is restored when the object is registered.
+        """Read the file, and return the number of steps done; None if there is no file.
 
-        Returns:
-            The number of steps done; None if there is no file.
+        Each object's state is restored when the object is registered.
 
         Raises:
             CheckpointError: The file is damaged, or belongs to another cell; the message names the
@@ -105,9 +95,6 @@ class Checkpoint:
 
         States that `load` has read are restored, in the order of the objects.
 
-        Args:
-            objects: Name of the state in the file -> object.
-
         Raises:
             CheckpointError: A state is missing or does not fit its object. The objects may be half
                 restored, and must not be used.
@@ -124,12 +111,9 @@ class Checkpoint:
                 ) from error
 
     def save_if_due(self, step: int) -> float:
-        """Write the file if the interval has passed.
+        """Write the file after step `step`, from 0, if the interval has passed.
 
         If the file can't be written, a warning is logged and training continues.
-
-        Args:
-            step: Number of the last finished step, from 0.
 
         Returns:
             The time of writing, seconds.
@@ -184,11 +168,6 @@ def _load(file: Path) -> State:
     with file.open("rb") as stream:
         arrays = npz.read(stream)
     state: State = json.loads(arrays.pop(_JSON_MEMBER).tobytes())
-    _put_back_tensors(state, arrays)
-    return state
-
-
-def _put_back_tensors(state: State, arrays: Mapping[str, NDArray[Any]]) -> None:
     for path, array in arrays.items():
         *folders, name = path.split("/")
         inner = state
@@ -196,3 +175,4 @@ def _put_back_tensors(state: State, arrays: Mapping[str, NDArray[Any]]) -> None:
             inner = inner[folder]
         # Cloned to get torch's memory alignment: the order of a vectorised sum may depend on it.
         inner[name] = torch.from_numpy(array).clone()
+    return state

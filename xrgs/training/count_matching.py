@@ -24,7 +24,6 @@ from xrgs.training.loop import train
 if TYPE_CHECKING:
     from xrgs.config import Conf
     from xrgs.splat.gaussians import Gaussians
-    from xrgs.splat.settings import DensifySettings
     from xrgs.training.dataset import Dataset
     from xrgs.training.loop import Evaluate
     from xrgs.training.recorder import TrainingResult
@@ -53,7 +52,7 @@ def train_cell(
         data: The training views and the SfM points.
         conf: The config.
         checkpoint: Saves and restores the run; None saves nothing.
-        evaluate: As for `train`.
+        evaluate: As for `xrgs.training.loop.train`.
 
     Returns:
         The trained Gaussians and the record of their training.
@@ -81,33 +80,23 @@ def train_count_matched(
     checkpoint: Checkpoint | None = None,
     evaluate: Evaluate | None = None,
 ) -> TrainingResult:
-    """Train until the number of Gaussians is `components.count_matched.gaussians`, above 0.
+    """Train as `train_cell`, with a number of Gaussians above 0.
 
-    `splat.densify.grow_grad2d` is the first threshold. `splat.strategy=mcmc` has no threshold: the
-    number is its budget. The arguments are as for `train`; the checkpoint includes the search.
-
-    Returns:
-        The result of the matching run; its `grow_grad2d` is the matching threshold.
-
-    Raises:
-        CheckpointError: The checkpoint does not fit this config and data.
-        XrgsError: Ten thresholds or the budget gave other numbers of Gaussians, or as for `train`.
+    `splat.densify.grow_grad2d` is the first threshold, and the result's `grow_grad2d` the matching
+    one. `splat.strategy=mcmc` has no threshold: the number is its budget. The checkpoint includes
+    the search.
     """
     checkpoint = checkpoint or Checkpoint()
     count_matched, densify = conf.components.count_matched, conf.splat.densify
     count_check = CountCheck(count_matched.gaussians, count_matched.tolerance, densify.stop)
 
-    def train_with(changed: DensifySettings) -> TrainingResult:
-        splat = replace(conf.splat, densify=changed)
+    def train_with(**changed: Any) -> TrainingResult:
+        splat = replace(conf.splat, densify=replace(densify, **changed))
         return train(data, replace(conf, splat=splat), checkpoint, [count_check], evaluate)
 
-    def train_at(threshold: float) -> TrainingResult:
-        return train_with(replace(densify, grow_grad2d=threshold))
-
-    if conf.splat.strategy == "mcmc":  # the budget is the number of Gaussians
+    if conf.splat.strategy == "mcmc":
         try:
-            budget = count_matched.gaussians / data.view_pixels
-            return train_with(replace(densify, budget=budget))
+            return train_with(budget=count_matched.gaussians / data.view_pixels)
         except CountMismatchError as mismatch:
             raise XrgsError(
                 f"components.count_matched.gaussians={count_matched.gaussians}:"
@@ -117,15 +106,11 @@ def train_count_matched(
             ) from mismatch
     search = ThresholdSearch(densify.grow_grad2d, count_matched.gaussians)
     checkpoint.register(search=search)
-    return search.run(train_at)
+    return search.run(lambda threshold: train_with(grow_grad2d=threshold))
 
 
 class CountMismatchError(Exception):
-    """The number of Gaussians after densification is outside the tolerance.
-
-    Attributes:
-        count: The number of Gaussians.
-    """
+    """The number of Gaussians after densification, `count`, is outside the tolerance."""
 
     def __init__(self, count: int) -> None:
         super().__init__(count)
@@ -133,33 +118,22 @@ class CountMismatchError(Exception):
 
 
 class CountCheck(Component):
-    """Ends a run once its number of Gaussians is final and outside the tolerance."""
+    """Ends a run by CountMismatchError once its number of Gaussians is final and does not match.
+
+    The number may deviate from `target` by a fraction `tolerance` of it. Densification stops at
+    step `stop` of a 30,000-step run.
+    """
 
     def __init__(self, target: int, tolerance: float, stop: int) -> None:
-        """Set the number of Gaussians, and the first step that checks it.
-
-        Args:
-            target: Number of Gaussians, above 0.
-            tolerance: Largest deviation, relative to `target`.
-            stop: Step of a 30,000-step run at which densification stops.
-        """
         self.target, self.tolerance, self.stop = target, tolerance, stop
 
     def after_backward(self, gaussians: Gaussians, step: Step) -> None:
-        """Check the number of Gaussians once densification has stopped.
-
-        Raises:
-            CountMismatchError: The number is outside the tolerance.
-        """
+        """Check the number of Gaussians once densification has stopped."""
         if step.nominal >= self.stop:
             self.after_training(gaussians)
 
     def after_training(self, gaussians: Gaussians) -> None:
-        """Check the number of Gaussians.
-
-        Raises:
-            CountMismatchError: The number is outside the tolerance.
-        """
+        """Check the number of Gaussians."""
         if abs(len(gaussians) / self.target - 1) > self.tolerance:
             raise CountMismatchError(len(gaussians))
 
@@ -175,24 +149,15 @@ class ThresholdSearch:
     """
 
     def __init__(self, start: float, target: int) -> None:
-        """Start with no attempts.
-
-        Args:
-            start: The first threshold to try, in normalised device units.
-            target: The number of Gaussians to reach.
-        """
+        """Start with no attempts; `start`, in normalised device units, is the first threshold."""
         self.start, self.target = start, target
         self.tried: list[tuple[float, int]] = []
 
     def run(self, train_at: Callable[[float], _T]) -> _T:
-        """Try thresholds until one matches.
+        """Try thresholds until one matches, and return the result of `train_at` for it.
 
-        Args:
-            train_at: Trains with a threshold, and raises `CountMismatchError` if the number of
-                Gaussians is outside the tolerance.
-
-        Returns:
-            The result of `train_at`.
+        `train_at` trains with a threshold, and raises `CountMismatchError` if the number of
+        Gaussians is outside the tolerance.
 
         Raises:
             XrgsError: Ten thresholds gave other numbers; the message lists them.
@@ -226,11 +191,7 @@ class ThresholdSearch:
 
 
 def next_threshold(tried: Sequence[tuple[float, int]], target: int) -> float:
-    """Choose the threshold to try next.
-
-    Args:
-        tried: (threshold, count) of each attempt so far, in order; at least one.
-        target: The number of Gaussians to reach.
+    """Choose the threshold to try next, after at least one (threshold, count).
 
     Returns:
         The threshold at which count ~ threshold^-p, fitted to the last two attempts, reaches the

@@ -30,15 +30,18 @@ class LoadedView:
     """A view in memory. Its photograph has 8 bits, a quarter of the memory of float32."""
 
     name: str
+    """Name of the view's photograph, unique among the views of a split."""
     tag: str
     """`HR` or `LR`."""
     camera: Camera
+    """The camera in the normalised world."""
     pixels: torch.Tensor
-    """[H, W, 3] photograph: uint8 as in the file, or floats in 0..1."""
+    """[H, W, 3] photograph: uint8 as in the file, or floats in 0..1. In training views the hidden
+    pixels outside the mask are replaced by colours from the inside."""
     sampling_rate: float = 1.0
     """Relative sampling rate in (0, 1], see `xrgs.mixture.views.View`."""
     mask: torch.Tensor | None = None
-    """[H, W] bool, True for a used pixel; None uses all."""
+    """[H, W] bool, True for a used pixel, at least one; None if all are used."""
     supersampling: float = 1.0
     """Factor of width and height to reach the finest views, see `xrgs.mixture.views.View`."""
 
@@ -85,7 +88,7 @@ class Dataset:
 def load(
     variant: Variant, use: str = "mixed", *, validation: float = 0.0, seed: int = 0
 ) -> Dataset:
-    """Read a variant's images and normalise its world.
+    """Read a variant's images, in its order, and normalise its world.
 
     Poses, points and world depend neither on `use` nor on `validation`: SfM has registered all
     views, also held-out and test views. So the controls differ from `mixed` only in the training
@@ -101,9 +104,6 @@ def load(
         seed: The cell's seed, which selects the held-out views: seeds 0, 1, ... hold out one part
             of the HR views after another, so that 1 / `validation` seeds are the folds of a
             cross-validation. The selection depends only on the variant, `validation` and `seed`.
-
-    Returns:
-        The dataset, with views in the order of the variant.
 
     Raises:
         UnreadableError: An image can't be read at the moment.
@@ -189,25 +189,19 @@ def _training_views(variant: Variant, use: str) -> list[View]:
 
 def _load_view(view: View, viewmat: NDArray[np.float64], *, hide: bool) -> LoadedView:
     """Load a view; with `hide`, pixels outside its mask are replaced (`masks.filled`)."""
-    camera = Camera(
-        viewmat=torch.from_numpy(viewmat).float(),
-        K=torch.from_numpy(view.K).float(),
-        width=view.width,
-        height=view.height,
-    )
     size = view.width, view.height
+    camera = Camera(torch.from_numpy(viewmat).float(), torch.from_numpy(view.K).float(), *size)
     # A copy, since PIL's memory is read-only.
     pixels = np.array(images.read_png_pil(view.file, size))
     mask = None if view.mask is None else images.read_mask(view.mask, size)
     if hide:
         pixels = masks.filled(pixels, mask)
-    used = None if mask is None else torch.from_numpy(mask)
     return LoadedView(
         view.name,
         view.tag,
         camera,
         torch.from_numpy(pixels),
         view.sampling_rate,
-        used,
+        None if mask is None else torch.from_numpy(mask),
         view.supersampling,
     )

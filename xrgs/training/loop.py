@@ -143,7 +143,6 @@ class _Run:
     memory: TrainingMemory
 
     def evaluates_after(self, step: int) -> bool:
-        """Return whether the Gaussians are evaluated after a step."""
         # Not after the last step, since the caller scores the trained Gaussians.
         done, every = step + 1, self.evaluate_every
         return bool(every) and done % every == 0 and done < self.steps
@@ -165,7 +164,6 @@ class _Forward:
     """The result of a step's forward pass."""
 
     camera: Camera
-    """The camera of the render."""
     sh_degree: int
     """Highest band of the spherical harmonics that was rendered."""
     means2d_offset: Tensor
@@ -286,7 +284,6 @@ def _first_gaussians(data: Dataset, conf: Conf, backend: str) -> tuple[Gaussians
 
 
 def _set_up(data: Dataset, conf: Conf, extra_components: Iterable[Component]) -> _Run:
-    """Build the objects of a run."""
     splat, steps = conf.splat, conf.train.steps
     backend = resolve_backend(splat.backend)
     gaussians, start_seconds = _first_gaussians(data, conf, backend)

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from xrgs.training.components.base import Step, TrainingView
 
 T = TypeVar("T")
-
-
 _CODE = (type, ModuleType, FunctionType)
 
 
@@ -36,12 +34,7 @@ class OnDemand(Mapping[str, T]):
     """
 
     def __init__(self, make: Callable[[TrainingView], T], views: Iterable[TrainingView]) -> None:
-        """Make the cached values.
-
-        Args:
-            make: Returns the value of a view: a tensor or an object with tensors.
-            views: The views, with unique names.
-        """
+        """Make the cached values by `make`; the names of the views are unique."""
         self.make = make
         self._views = {view.name: view for view in views}
         self.kept: dict[str, T] = {}
@@ -108,11 +101,8 @@ class TrainingMemory:
     ) -> Iterator[None]:
         """Measure the tensors that autograd saves in the forward pass, once for each kind of step.
 
-        Args:
-            step: The step.
-            gaussians: The number of Gaussians.
-            sh_degree: Highest band of the spherical harmonics that is rendered.
-            kept: Whether the SSIM statistics of the view's photograph are cached.
+        Besides the step, its number of Gaussians, the highest rendered band of the spherical
+        harmonics and whether the SSIM statistics of its photograph are `kept` are its kind.
         """
         camera, logged = step.view.camera, sorted(step.log.items())
         size = f"{camera.width} x {camera.height} px"

@@ -9,8 +9,8 @@ from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
 from xrgs.runtime.machine import wait_for_gpu
+from xrgs.splat.sh import bases
 from xrgs.splat.strategy.refinement import Refinement
-from xrgs.training.work import StepWork
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
@@ -50,7 +50,17 @@ class TrainingResult:
     evaluations: int
     """Number of alpha evaluations of all forward passes: the work, independent of the machine."""
     work: dict[str, int]
-    """Further counts of work: `StepWork.totals`."""
+    """Further counts of work, all but `views` summed over the steps:
+
+    - `views`: number of views that were trained on,
+    - `gaussians`, `gaussians_visible`,
+    - `pixels` of the renders, `pixels_photograph` of the photographs, and `pixels_left_out`, the
+      pixels that smaller renders saved,
+    - `pairs` of a pixel and a Gaussian, `pairs_visible` of a pixel and a visible Gaussian,
+      `pairs_in_tiles` (`Render.tile_evaluations`),
+    - `sh_coefficients` of visible Gaussians, and `sh_coefficients_left_out` of bands that were not
+      on.
+    """
     stage_seconds: dict[str, float]
     """Stage -> its part of `seconds`: `start` if there is a dense start, `forward` (render and
     loss), `backward`, `optimizer`, and `densification` with the rest of the step."""
@@ -69,13 +79,7 @@ class TrainingRecorder:
     """
 
     def __init__(self, steps: int, grow_grad2d: float, views: Iterable[TrainingView]) -> None:
-        """Start the clock, with an empty history.
-
-        Args:
-            steps: Number of steps of the whole run.
-            grow_grad2d: The run's threshold of densification, for the result.
-            views: All training views, with the cameras of their photographs.
-        """
+        """Start the clock of a run of `steps` steps, with an empty history."""
         self.started = self.lap_started = time.perf_counter()
         self.grow_grad2d = grow_grad2d
         self.row_every = max(1, steps // _HISTORY_ROWS)
@@ -85,15 +89,15 @@ class TrainingRecorder:
         self.history: list[dict[str, Any]] = []
         self.scores: list[dict[str, Any]] = []
         self.evaluations = 0
-        self.work = StepWork(views)
+        self.work: Counter[str] = Counter()
+        self.photographs = {v.name: v.camera.width * v.camera.height for v in views}
+        """View name -> number of pixels of its photograph."""
+        self.trained: set[str] = set()
+        """Names of the views that were trained on."""
         self.stage_seconds: defaultdict[str, float] = defaultdict(float)
 
     def lap(self, stage: str) -> None:
-        """Add the time since the last lap, or since the start, to a stage.
-
-        Args:
-            stage: A key of `TrainingResult.stage_seconds`.
-        """
+        """Add the time since the last lap, or since the start, to a stage."""
         wait_for_gpu()
         now = time.perf_counter()
         self.stage_seconds[stage] += now - self.lap_started
@@ -105,27 +109,19 @@ class TrainingRecorder:
         self.stage_seconds["start"] += seconds
 
     def record_skipped(self, part: str) -> None:
-        """Count a skipped part of a step; call it before `record_step`.
-
-        Args:
-            part: `backward` (with the update) or `shN`; the history's column is `skipped_<part>`.
-        """
+        """Count a skipped `backward` or `shN` of a step; call it before `record_step`."""
         self.counts[f"skipped_{part}"] += 1
 
     def record_step(
         self, step: Step, loss: torch.Tensor, render: Render, gaussians: Gaussians, sh_degree: int
     ) -> None:
-        """Record a step after its update and before its densification.
+        """Record a step, its render and its scalar loss, after the update.
 
-        Args:
-            step: The step, with the values that the components logged.
-            loss: Scalar, the loss of the step.
-            render: The step's render.
-            gaussians: The Gaussians that were rendered.
-            sh_degree: Highest band of the spherical harmonics that was rendered.
+        `sh_degree` is the highest band of the spherical harmonics that was rendered. The
+        densification of the step comes later.
         """
         self.evaluations += render.evaluations
-        self.work.add(step, render, gaussians, sh_degree)
+        self._count_work(step, render, gaussians, sh_degree)
         self.counts[f"steps_{step.view.tag}"] += 1
         for name, value in step.log.items():
             self.logged[name].append(value)
@@ -134,6 +130,24 @@ class TrainingRecorder:
             means = {name: fmean(values) for name, values in self.logged.items()}
             self.history.append(row | {"gaussians": len(gaussians)} | self.counts | means)
             self.logged.clear()
+
+    def _count_work(self, step: Step, render: Render, gaussians: Gaussians, sh_degree: int) -> None:
+        visible, pixels = int(render.visible.count_nonzero()), render.alpha.numel()
+        photograph = self.photographs[step.view.name]
+        stored = gaussians.shN.shape[1] + 1
+        self.trained.add(step.view.name)
+        self.work.update(
+            gaussians=len(gaussians),
+            gaussians_visible=visible,
+            pixels=pixels,
+            pixels_photograph=photograph,
+            pixels_left_out=max(0, photograph - pixels),
+            pairs=len(gaussians) * pixels,
+            pairs_visible=visible * pixels,
+            pairs_in_tiles=render.tile_evaluations,
+            sh_coefficients=visible * stored,
+            sh_coefficients_left_out=visible * (stored - bases(sh_degree)),
+        )
 
     def record_evaluations(self, evaluations: int) -> None:
         """Count the alpha evaluations of a render other than that of a step."""
@@ -147,13 +161,7 @@ class TrainingRecorder:
     def record_scores(
         self, steps: int, gaussians: int, evaluate: Callable[[], Mapping[str, float | None]]
     ) -> None:
-        """Evaluate the Gaussians; the time does not count as training time.
-
-        Args:
-            steps: Number of finished steps.
-            gaussians: Number of Gaussians.
-            evaluate: Returns name -> score.
-        """
+        """Record the scores of `evaluate`, whose time does not count, after `steps` steps."""
         start = time.perf_counter()
         row = {
             "step": steps,
@@ -178,7 +186,7 @@ class TrainingRecorder:
             "history": self.history,
             "scores": self.scores,
             "evaluations": self.evaluations,
-            "work": self.work.state_dict(),
+            "work": {"counts": dict(self.work), "views": sorted(self.trained)},
             "stage_seconds": dict(self.stage_seconds),
         }
 
@@ -191,7 +199,8 @@ class TrainingRecorder:
         self.history = list(state["history"])
         self.scores = list(state["scores"])
         self.evaluations = int(state["evaluations"])
-        self.work.load_state_dict(state["work"])
+        self.work = Counter(state["work"]["counts"])
+        self.trained = set(state["work"]["views"])
         self.stage_seconds = defaultdict(float, state["stage_seconds"])
 
     def finish(self, gaussians: Gaussians, memory_bytes: int) -> TrainingResult:
@@ -204,7 +213,7 @@ class TrainingRecorder:
             seconds,
             memory_bytes,
             self.evaluations,
-            self.work.totals(),
+            {"views": len(self.trained)} | dict(self.work),
             dict(self.stage_seconds),
             self.grow_grad2d,
             self.scores,

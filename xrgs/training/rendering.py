@@ -24,12 +24,7 @@ def inside_mask(image: Tensor, photograph: Tensor, mask: Tensor | None) -> Tenso
 
     So they have no loss and no gradient. SSIM windows across the border of the mask compare equal
     pixels outside it. The loss remains a mean over all pixels, and used pixels have the same
-    gradients as without a mask.
-
-    Args:
-        image: The render, [H, W, 3].
-        photograph: [H, W, 3].
-        mask: [H, W] bool, True for a used pixel; None uses all.
+    gradients as without a mask. Images are [H, W, 3], the mask [H, W] is True for a used pixel.
     """
     return image if mask is None else image.where(mask[..., None], photograph)
 
@@ -43,15 +38,12 @@ class StepRenderer:
     """
 
     components: Components
-    """The components of the run."""
     raster: RasterSettings
-    """How Gaussians become pixels."""
     sh_every: int
     """Steps of this run between the activations of two bands of the spherical harmonics."""
     backend: str
     """`torch` or `native`."""
     recorder: TrainingRecorder
-    """Counts the alpha evaluations."""
 
     def sh_degree(self, step: Step) -> int:
         """Return the highest band of the spherical harmonics that is on at a step."""
@@ -60,16 +52,10 @@ class StepRenderer:
     def render(
         self, gaussians: Gaussians, step: Step, camera: Camera, means2d_offset: Tensor | None = None
     ) -> Render:
-        """Render the step's view, differentiable in the Gaussians.
+        """Render the step's view, differentiable in the N Gaussians.
 
-        Args:
-            gaussians: The N Gaussians.
-            step: The step with the view to render.
-            camera: The view's camera after the components' `render_camera`.
-            means2d_offset: [N, 2] as for `rasterize_parameters`.
-
-        Returns:
-            The render at the camera's size. Its alpha evaluations are not yet counted.
+        `camera` is the view's after the components' `render_camera`; `means2d_offset` [N, 2] is as
+        for `rasterize_parameters`. The alpha evaluations are not yet counted.
         """
         raw = not self.components.override("before_render")
         return rasterize_parameters(
@@ -90,8 +76,7 @@ class StepRenderer:
     def photograph(self, gaussians: Gaussians, step: Step) -> Tensor:
         """Render the step's view as for the loss; outside the mask it is the photograph.
 
-        Returns:
-            [H, W, 3] at the photograph's size, not clamped to 0..1, detached from autograd.
+        The image is at the photograph's size, not clamped to 0..1.
         """
         camera = self.components.render_camera(step.view.camera, step)
         render = self.render(gaussians, step, camera)
@@ -104,13 +89,8 @@ class StepRenderer:
     def attribute(self, pixels: Tensor, gaussians: Gaussians, step: Step) -> Tensor:
         """Sum a map over the view's photograph for each Gaussian, by its blending weights.
 
-        As `attribute_pixels`, with blending weights at the photograph's size. `to_photograph` is
-        linear, so the transpose of it is applied to the map instead.
-
-        Args:
-            pixels: [H, W] the map, at the photograph's size.
-            gaussians: The N Gaussians.
-            step: The step with the view to render.
+        As `attribute_pixels`, with the map [H, W] and the blending weights at the photograph's
+        size. `to_photograph` is linear, so the transpose of it is applied to the map instead.
 
         Returns:
             Sums [N], in the unit of the map times px of the photograph.

@@ -53,19 +53,13 @@ class EpochSampler:
         allows_view: Callable[[Step], bool],
         hr_share: float = 0.0,
     ) -> None:
-        """Start before the first step.
+        """Start before the first of the run's steps; the names of the views are unique.
 
-        Args:
-            views: The training views; their names are unique.
-            seed: `seed` of the config, which determines the order of the views.
-            steps: Number of steps of the whole run.
-            allows_view: Returns whether a step may train on its view.
-            hr_share: Least fraction of the steps that draw an HR view, 0..1.
+        `allows_view` returns whether a step may train on its view. At least a fraction `hr_share`
+        of the steps draws an HR view.
         """
-        self.views = views
-        self.steps = steps
-        self.allows_view = allows_view
-        self.hr_share = hr_share
+        self.views, self.steps = views, steps
+        self.allows_view, self.hr_share = allows_view, hr_share
         self.next_step = 0
         """Number of the next step, from 0."""
         self.generator = seeded_generator(seed, "views")
@@ -121,12 +115,7 @@ class EpochSampler:
         }
 
     def load_state_dict(self, state: State) -> None:
-        """Continue a run of the same views, seed and number of steps.
-
-        Raises:
-            KeyError: An entry is missing, or names an unknown view.
-            ValueError: The state is of a run with another `hr_share`.
-        """
+        """Continue a run of the same views, seed, `hr_share` and number of steps."""
         by_name = {view.name: view for view in self.views}
         self.next_step = int(state["next_step"])
         for members, names in zip(self.classes, state["remaining"], strict=True):

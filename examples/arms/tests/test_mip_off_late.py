@@ -86,8 +86,5 @@ def test_a_value_out_of_range_names_its_key(
     ((name, value),) = setting.items()
     with pytest.raises(XrgsError, match=rf"^components\.plugins\.mip_off_late\.{name}={value}"):
         build(off)
-
-
-def test_a_variance_of_0_is_off(build: Callable[..., Components], off: ComponentsConf) -> None:
     off.plugins["mip_off_late"] = {"variance": 0.0}
     assert build(off) == ()

@@ -12,7 +12,6 @@ from scipy.ndimage import correlate
 from torch import Tensor
 
 from examples.arms.tests.conftest import with_arms
-from tests.splat.scenes import noise
 from tests.training.components.conftest import renderer_of
 from xrgs.config import ComponentsConf
 from xrgs.errors import XrgsError
@@ -73,11 +72,6 @@ def edges_in_scipy(image: Tensor) -> Tensor:
     return torch.from_numpy(np.abs(correlate(image.sum(dim=-1).numpy(), kernel, mode="nearest")))
 
 
-def test_edges_are_scipys_laplacian() -> None:
-    image = noise(9, 13, 5)
-    torch.testing.assert_close(edges(image), edges_in_scipy(image))
-
-
 @pytest.mark.parametrize("of", ["edges", "errors"])
 def test_what_grows_is_ranked_by_edges_or_errors(
     build: Build, off: ComponentsConf, hr: Step, shown: Gaussians, fine: list[LoadedView], of: str
@@ -88,6 +82,7 @@ def test_what_grows_is_ranked_by_edges_or_errors(
         pixels = (image_of(shown.activated(), view) - view.image).abs().mean(dim=-1)
         if of == "edges":
             laplacian = edges_in_scipy(view.image)
+            torch.testing.assert_close(edges(view.image), laplacian)
             pixels = (laplacian - laplacian.min()) / (laplacian.max() - laplacian.min())
         sums = attributed(pixels, shown, view)
         expected += sums / sums[sums > 0].mean() / 2
@@ -144,22 +139,15 @@ def test_a_value_out_of_range_names_its_key(
 
 
 @pytest.mark.parametrize(
-    ("name", "settings"), [("multiview_score", {"views": 2}), ("error_score", {"of": "edges"})]
+    ("name", "on", "off_"),
+    [("multiview_score", {"views": 2}, {"views": 0}), ("error_score", {"of": "edges"}, {})],
 )
-def test_a_strategy_that_draws_what_grows_refuses_them(
-    name: str, settings: dict[str, object], build: Build, off: ComponentsConf
+def test_they_are_off_or_refused_by_a_strategy_that_draws_what_grows(
+    name: str, on: dict[str, object], off_: dict[str, object], build: Build, off: ComponentsConf
 ) -> None:
-    off.plugins[name] = settings
+    off.plugins[name] = off_
+    assert build(off) == ()
+    off.plugins[name] = on
     (component,) = parts = build(off)
     with pytest.raises(XrgsError, match=type(component).__name__):
         parts.check_strategy("mcmc", MCMCStrategy)
-
-
-@pytest.mark.parametrize(
-    ("name", "settings"), [("multiview_score", {"views": 0}), ("error_score", {})]
-)
-def test_they_are_off(
-    name: str, settings: dict[str, object], build: Build, off: ComponentsConf
-) -> None:
-    off.plugins[name] = settings
-    assert build(off) == ()

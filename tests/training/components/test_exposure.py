@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -10,17 +9,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.conftest import composed
 from tests.splat.scenes import noise
-from tests.training.components.conftest import make_view, renderer_of
+from tests.training.components.conftest import NO_GAUSSIANS, Build, make_view, renderer_of
 from xrgs.config import ComponentsConf, ExposureConf
 from xrgs.splat.gaussians import Gaussians
-from xrgs.training.components import Components, Step
+from xrgs.training.components import Step
 from xrgs.training.components.exposure import Exposure, apply_map
-from xrgs.training.dataset import Dataset, LoadedView
-from xrgs.training.loop import train
-
-Build = Callable[..., Components]
+from xrgs.training.dataset import LoadedView
 
 
 @pytest.fixture
@@ -48,7 +43,7 @@ def teach(component: Exposure, name: str, number: int = 0, brighter: float = 1.3
     step, render = on_view(name, number), noise(12, 15, 3)
     mapped = component.match_colors(render, step)
     torch.autograd.backward((mapped - brighter * render).square().mean())
-    component.after_backward(Gaussians(*[torch.empty(0)] * 6), step)
+    component.after_backward(NO_GAUSSIANS, step)
 
 
 def test_a_map_is_a_matrix_and_an_offset() -> None:
@@ -60,11 +55,6 @@ def test_a_map_is_a_matrix_and_an_offset() -> None:
 def test_gradients_are_those_of_finite_differences() -> None:
     image, colors = noise(4, 5, 0).requires_grad_(), noise(3, 4, 1)[..., 0].requires_grad_()
     assert torch.autograd.gradcheck(apply_map, (image, colors))
-
-
-def test_the_maps_begin_as_the_identity(build: Build, on: ComponentsConf, hr: Step) -> None:
-    image = noise(60, 75, 4)
-    assert torch.equal(build(on).match_colors(image, hr), image)
 
 
 @pytest.mark.parametrize("mode", ["affine", "gain"])
@@ -92,7 +82,7 @@ def mean_of_hr(component: Exposure) -> Tensor:
     return torch.stack([component.map_of(name) for name in component.names[:-1]]).mean(dim=0)
 
 
-@pytest.mark.parametrize("count", [1, 2, 5])
+@pytest.mark.parametrize("count", [1, 5])
 def test_the_mean_map_of_the_hr_views_is_the_identity(count: int) -> None:
     component = exposure(count=count)
     for number, name in enumerate(component.names * 2):
@@ -101,12 +91,8 @@ def test_the_mean_map_of_the_hr_views_is_the_identity(count: int) -> None:
     assert not torch.allclose(component.map_of("low"), torch.eye(3, 4), atol=1e-3)
     if count == 1:
         assert torch.equal(component.map_of("h0"), torch.eye(3, 4))
-
-
-def test_without_hr_views_the_mean_is_over_all(build: Build, on: ComponentsConf) -> None:
-    views = [replace(make_view("LR", noise(12, 15, 1)), name=name) for name in ("a", "b")]
-    (component,) = build(on, *views)
-    assert isinstance(component, Exposure)
+    low = [replace(make_view("LR", noise(12, 15, 1)), name=name) for name in ("a", "b")]
+    component = Exposure(component.settings, low)  # without HR views the mean is over all
     teach(component, "a")
     total = component.map_of("a") + component.map_of("b")
     torch.testing.assert_close(total, 2 * torch.eye(3, 4))
@@ -117,7 +103,7 @@ def test_a_render_without_gradients_teaches_nothing() -> None:
     component, step = exposure(), on_view("low")
     with torch.no_grad():
         component.match_colors(noise(12, 15, 3), on_view("h0"))
-    component.after_backward(Gaussians(*[torch.empty(0)] * 6), step)
+    component.after_backward(NO_GAUSSIANS, step)
     assert torch.equal(component.map_of("low"), torch.eye(3, 4))
     assert step.log == {}
 
@@ -152,17 +138,3 @@ def test_the_gain_is_recorded_and_its_extremes_are_named() -> None:
     assert step.log["exposure.gain"] == pytest.approx(1.2)
     (found,) = component.findings()
     assert found.endswith("0.900 (h0) to 1.200 (low)")
-
-
-def test_training_finds_the_gains_of_photographs(data: Dataset) -> None:
-    """Photographs of one scene, one in four of them darker; the splats keep the others' colours."""
-    views = [replace(view, camera=data.train[0].camera, tag="HR") for view in data.train]
-    image = data.train[0].image
-    views = [replace(v, pixels=image * (0.6 if v.name == "v2" else 1.0)) for v in views]
-    lr = "components.exposure.lr=0.04"
-    conf = composed("train.steps=200", "splat.backend=auto", "+ablation=exposure_gain", lr)
-    history = train(replace(data, train=tuple(views)), conf).history
-    last = {row["view"]: row["exposure.gain"] for row in history if row["step"] > 150}
-    others = (last["v0"] + last["v1"] + last["v3"]) / 3
-    assert last["v2"] / others == pytest.approx(0.6, abs=0.05)
-    assert (last["v2"] + 3 * others) / 4 == pytest.approx(1, abs=0.02)

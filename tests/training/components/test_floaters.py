@@ -13,8 +13,7 @@ from torch import Tensor
 
 from tests.conftest import composed as compose
 from tests.splat.scenes import noise
-from tests.training.conftest import comparable
-from xrgs.config import Conf, FloatersConf
+from xrgs.config import FloatersConf
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import Gaussians
 from xrgs.splat.settings import DensifySettings
@@ -118,17 +117,6 @@ def test_a_view_without_points_in_its_image_removes_nothing(looking: list[Loaded
     assert not removed.any()
 
 
-def test_a_guard_that_nothing_is_close_enough_for_changes_no_bit(
-    data: Dataset, short: Conf
-) -> None:
-    plain = comparable(train(data, short))
-    short.components.floaters.near_share = 1e-3
-    guarded = comparable(train(data, short))
-    for result in (plain, guarded):
-        del result["memory_bytes"]
-    assert guarded == plain
-
-
 def test_a_trained_model_has_no_gaussian_before_the_limit(data: Dataset) -> None:
     """One of 200 first Gaussians is close to the cameras, which are all in one place."""
     generator = torch.Generator().manual_seed(1)
@@ -136,8 +124,6 @@ def test_a_trained_model_has_no_gaussian_before_the_limit(data: Dataset) -> None
     points[0] = torch.tensor([0.01, 0.02, 0.3])
     data = replace(data, points=points, colors=torch.rand(200, 3, generator=generator))
     conf = compose("train.steps=40", "splat.backend=auto", "splat.densify.stop=0")
-    closest = train(data, conf).gaussians.means[:, 2].min()
-    assert closest < 0.5
     conf.components.floaters.near_share = 0.5
     result = train(data, conf)
     assert result.gaussians.means[:, 2].min() > 0.7

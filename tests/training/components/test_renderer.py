@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import torch
 
-from tests.training.components.conftest import renderer_of
+from tests.training.components.conftest import Build, renderer_of
 from xrgs.config import ComponentsConf
 from xrgs.splat.gaussians import ActivatedGaussians, Gaussians
 from xrgs.splat.rendering import rasterize_parameters
@@ -25,7 +24,7 @@ class Lowered(Component):
 
 
 def test_views_are_rendered_with_all_components(
-    build: Callable[..., Components],
+    build: Build,
     off: ComponentsConf,
     lr: Step,
     shown: Gaussians,

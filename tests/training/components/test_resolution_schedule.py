@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +12,7 @@ from torch.nn.functional import interpolate
 
 from tests.conftest import composed as compose
 from tests.splat.scenes import noise
+from tests.training.components.conftest import Build
 from tests.training.conftest import same
 from xrgs.config import ComponentsConf, Conf
 from xrgs.errors import XrgsError
@@ -21,8 +21,6 @@ from xrgs.training.components import Components, Step, TrainingView
 from xrgs.training.components.resolution_schedule import ResolutionSchedule, kept_shares
 from xrgs.training.dataset import Dataset, LoadedView
 from xrgs.training.loop import train
-
-Build = Callable[..., Components]
 
 
 @pytest.fixture
@@ -67,26 +65,22 @@ def test_images_add_their_magnitudes() -> None:
         kept += spectrum[top - h : top + h + 1, left - w : left + w + 1].sum()
         total += spectrum.sum()
     assert kept_shares(images, [2]) == pytest.approx({2: kept / total}, abs=1e-6)
-
-
-def test_a_black_photograph_keeps_everything() -> None:
     assert kept_shares([torch.zeros(12, 12, 3)], [1, 8]) == {1: 1.0, 8: 1.0}
 
 
-@pytest.mark.parametrize(
-    ("nominal", "factor"),
-    [(0, 4), (3112, 4), (3114, 2), (7499, 2), (7501, 1), (15_000, 1), (29_999, 1)],
-)
 def test_the_factor_falls_as_the_share_that_is_needed_rises(
-    build: Build, on: ComponentsConf, hr: Step, nominal: int, factor: int
+    build: Build, on: ComponentsConf, hr: Step, lr: Step
 ) -> None:
     component = _component(build(on))
+    assert list(component.kept) == [1, 2, 3, 4, 5]  # of 60 px, the window of SSIM and more
     # 0.25^(1 - t / 15,000) is 1 / 3 at t = 3,113 and 1 / 2 at t = 7,500.
     component.kept = {1: 1.0, 2: 0.5, 3: 1 / 3, 4: 1 / 3}
-    assert component.factor_at(replace(hr, number=nominal)) == factor
-    third = replace(hr, number=nominal // 3, total=10_000)
-    if nominal % 3 == 0:
-        assert component.factor_at(third) == factor
+    factors = {0: 4, 3112: 4, 3114: 2, 7499: 2, 7501: 1, 15_000: 1, 29_999: 1}
+    for number, factor in factors.items():
+        assert component.factor_at(replace(hr, number=number)) == factor
+    assert component.factor_at(replace(hr, number=1038, total=10_000)) == 2
+    with pytest.raises(XrgsError, match="no HR view"):
+        build(on, lr.view)
 
 
 def test_an_hr_view_is_made_smaller_and_shows_the_same(
@@ -104,11 +98,6 @@ def test_an_hr_view_is_made_smaller_and_shows_the_same(
     torch.testing.assert_close(ours, full * torch.tensor([38 / 75, 0.5]))
     assert (view.name, view.tag, view.sampling_rate) == (hr.view.name, "HR", hr.view.sampling_rate)
     assert hr.log == {"resolution_schedule.factor": 2}
-
-
-def test_lr_views_are_never_reduced(build: Build, on: ComponentsConf, hr: Step, lr: Step) -> None:
-    parts = build(on)
-    _component(parts).kept = {1: 1.0, 2: 0.9}
     assert _views(parts, hr, lr) is lr.view
     assert lr.log == {}
 
@@ -123,15 +112,6 @@ def test_views_are_made_once_for_each_factor(
     assert [views["hr"].camera.width for views in at.values()] == [19, 19, 25, 38, 75]
     assert at[9000] is own
     assert _component(parts).reduced == {}  # nothing is held that is no longer used
-
-
-def test_every_view_keeps_the_window_of_ssim(build: Build, on: ComponentsConf) -> None:
-    assert list(_component(build(on)).kept) == [1, 2, 3, 4, 5]  # of 60 px, 11 px and more
-
-
-def test_without_hr_views_it_is_an_error(build: Build, on: ComponentsConf, lr: Step) -> None:
-    with pytest.raises(XrgsError, match="no HR view"):
-        build(on, lr.view)
 
 
 class HalvedFirst(ResolutionSchedule):
@@ -162,14 +142,3 @@ def test_the_start_is_a_training_on_small_photographs(data: Dataset) -> None:
     expected = _after_20_steps(replace(data, train=small), conf)
     assert same(_after_20_steps(data, conf, component), expected)
     assert not same(_after_20_steps(data, conf), expected)
-
-
-@pytest.mark.parametrize("with_", ["+ablation=supersampled", "+ablation=consistency"])
-def test_it_goes_with_what_compares_at_other_sizes(data: Dataset, with_: str) -> None:
-    overrides = ["train.steps=20", "splat.backend=auto", "splat.densify.stop=0", with_]
-    overrides.append("components.resolution_schedule.until=15000")
-    plain = train(data, compose(*overrides))
-    reduced = train(data, compose(*overrides, "components.resolution_schedule.start_share=0.1"))
-    assert not same(plain.gaussians, reduced.gaussians)
-    assert reduced.evaluations < plain.evaluations
-    assert reduced.history[-1]["resolution_schedule.factor"] in {None, 1}

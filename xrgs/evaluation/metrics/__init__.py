@@ -105,14 +105,10 @@ def also_scored(names: frozenset[str]) -> Iterator[None]:
 def score_view(
     image: Tensor, target: Tensor, mask: Tensor | None, *, masked: bool
 ) -> dict[str, float | None]:
-    """Score a render against its photograph with every metric of views.
+    """Score a render against its photograph with every metric of views; arguments as for `psnr`.
 
-    Args:
-        image: The render, [H, W, 3] in 0..1.
-        target: The photograph, [H, W, 3] in 0..1.
-        mask: [H, W] bool, True for a used pixel; None if the view has no mask.
-        masked: Whether any of the views of the evaluation has a mask. If so, a view without a mask
-            is scored with a mask of all pixels, so that every view has the same scores.
+    If any view of the evaluation is `masked`, a view without a mask is scored with a mask of all
+    pixels, so that every view has the same scores.
 
     Returns:
         Metric name -> score; None if it can't be computed or does not apply.

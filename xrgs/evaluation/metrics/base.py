@@ -34,12 +34,8 @@ def inside(image: Tensor, target: Tensor, mask: Tensor | None) -> tuple[Tensor, 
     """Replace the pixels of image and target outside the mask by equal colours.
 
     Both get the colour of the target's nearest used pixel. So pixels outside the mask do not
-    differ, and no window of a metric contains the hidden ones.
-
-    Args:
-        image: The render, [H, W, 3].
-        target: The photograph, [H, W, 3].
-        mask: [H, W] bool, True for a used pixel; None uses all.
+    differ, and no window of a metric contains the hidden ones. Arguments as for
+    `xrgs.evaluation.metrics.psnr.psnr`.
 
     Raises:
         ValueError: The shapes differ or are not [H, W, 3].

@@ -16,12 +16,7 @@ def lpips(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | 
 
     Source: [zhang2018] "The unreasonable effectiveness of deep features as a perceptual
     metric"; see `xrgs.evaluation.lpips.network`. Outside the mask both images are made equal. The
-    distance is the mean over the whole image.
-
-    Args:
-        image: The render, [H, W, 3] in 0..1.
-        target: The photograph, [H, W, 3] in 0..1.
-        mask: [H, W] bool, True for a used pixel; None uses all.
+    distance is the mean over the whole image. Arguments as for `psnr`.
 
     Returns:
         The distance, 0 for identical images; None (n/a in the tables) if this machine has no

@@ -21,18 +21,10 @@ def psnr_fitted(image: Tensor, target: Tensor, mask: Tensor | None = None) -> fl
     "Colour-corrected" scores are common if training fits exposures, but with other maps: `cc_psnr`
     of gsplat 1.6.0 [ye2025] fits a line from photograph to render in each channel and inverts it,
     or fits the photograph by a quadratic function of the render's three channels, which is the only
-    map of 1.5.3. So their values are not comparable.
-
-    Args:
-        image: The render, [H, W, 3] in 0..1.
-        target: The photograph, [H, W, 3] in 0..1.
-        mask: [H, W] bool, True for a used pixel; None uses all.
+    map of 1.5.3. So their values are not comparable. Arguments and errors are those of `psnr`.
 
     Returns:
         The ratio, dB, up to rounding at least that of `psnr`. None if no pixel is used.
-
-    Raises:
-        ValueError: The shapes differ or are not [H, W, 3].
     """
     import torch
 

@@ -22,12 +22,7 @@ def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | N
     borders. gsplat's evaluation gives the same to the fourth digit.
 
     Source: [wang2004] "Image quality assessment: from error visibility to structural
-    similarity".
-
-    Args:
-        image: The render, [H, W, 3] in 0..1.
-        target: The photograph, [H, W, 3] in 0..1.
-        mask: [H, W] bool, True for a used pixel; None uses all.
+    similarity". Arguments as for `psnr`.
 
     Returns:
         A value in -1..1; 1 for identical images. None if no pixel is used.

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from xrgs import plugins
 from xrgs.config import is_on
 from xrgs.errors import XrgsError
-from xrgs.registry import BUILT_IN, ComponentEntry
+from xrgs.registry import BUILT_IN
 from xrgs.training.components.base import (
     Component,
     Step,
@@ -47,14 +47,7 @@ __all__ = [
 def build(
     conf: ComponentsConf, data: Dataset, splat: SplatConf, backend: str = "torch", seed: int = 0
 ) -> Components:
-    """Build the components that are on in a config.
-
-    Args:
-        conf: `components` of the config.
-        data: The training data.
-        splat: `splat` of the config.
-        backend: `torch` or `native`: the implementation that renders and computes losses.
-        seed: `seed` of the config.
+    """Build the components that are on; the arguments are those of `TrainingSetup`.
 
     Returns:
         The built-in components that are on, then those of other packages in order of their names.
@@ -64,23 +57,16 @@ def build(
             has no view or weight to act on, or a plugin cannot be used.
     """
     setup = TrainingSetup(conf, data, splat, backend, seed)
-    built = [
-        _import(entry).from_settings(getattr(conf, key), setup)
-        for key, entry in BUILT_IN.items()
-        if any(is_on(getattr(conf, name)) for name in (key, *entry.reads))
-    ]
+    built: list[Component | None] = []
+    for key, entry in BUILT_IN.items():
+        if any(is_on(getattr(conf, name)) for name in (key, *entry.reads)):
+            kind = getattr(import_module(f"{__name__}.{entry.module}"), entry.name)
+            built.append(kind.from_settings(getattr(conf, key), setup))
     built += [_build_plugin(name, values, setup) for name, values in sorted(conf.plugins.items())]
     return Components(component for component in built if component is not None)
 
 
-def _import(entry: ComponentEntry) -> type[Component]:
-    module = import_module(f"{__name__}.{entry.module}")
-    component: type[Component] = getattr(module, entry.name)
-    return component
-
-
 def _build_plugin(name: str, values: Mapping[str, Any], setup: TrainingSetup) -> Component | None:
-    """Build the component of another package from its values in the config; None if it is off."""
     key = f"components.plugins.{name}"
     kind = plugins.load(name)
     if not (isinstance(kind, type) and issubclass(kind, Component)):

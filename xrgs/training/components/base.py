@@ -36,6 +36,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
 
 from xrgs.errors import XrgsError
 from xrgs.splat.settings import NOMINAL_STEPS
+from xrgs.training.dataset import LoadedView
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -49,41 +50,8 @@ if TYPE_CHECKING:
     from xrgs.splat.strategy.refinement import Groups
     from xrgs.training.dataset import Dataset
 
-
-class TrainingView(Protocol):
-    """A training view as components see it."""
-
-    @property
-    def name(self) -> str:
-        """Name of the view's photograph, unique among the views."""
-
-    @property
-    def tag(self) -> str:
-        """Resolution class of the view, `HR` or `LR`."""
-
-    @property
-    def sampling_rate(self) -> float:
-        """Sampling rate of the view, relative to the highest rate of all views, in (0, 1]."""
-
-    @property
-    def supersampling(self) -> float:
-        """Factor of width and height at which the view would be as fine as the finest views."""
-
-    @property
-    def camera(self) -> Camera:
-        """The camera in the normalised world."""
-
-    @property
-    def image(self) -> Tensor:
-        """The photograph [H, W, 3] in 0..1. Each access may return a new tensor.
-
-        Outside the mask it is filled with colours from the inside: the hidden pixels are not
-        loaded.
-        """
-
-    @property
-    def mask(self) -> Tensor | None:
-        """[H, W] bool, True for a used pixel, at least one; None if all are used."""
+TrainingView = LoadedView
+"""A training view as components see it."""
 
 
 @dataclass(frozen=True)
@@ -138,6 +106,9 @@ class TrainingSetup:
 class Component:
     """One change to training. Every hook changes nothing unless a subclass overrides it.
 
+    The hooks' `step` is the step with its view, `gaussians` are the N trained Gaussians, and images
+    are [H, W, 3].
+
     Attributes:
         settings_type: For components of other packages: the dataclass of their settings. xrgs
             builds it from `components.plugins.<name>` of the config, and checks names and types.
@@ -164,12 +135,9 @@ class Component:
         raise NotImplementedError(f"{cls.__name__} does not define from_settings")
 
     def before_training(self, renderer: ViewRenderer) -> None:
-        """Get a renderer, for a component that renders views other than the step's.
+        """Get a renderer of any training view, with all components of the run.
 
         Training calls this once, before the first step or the first step after a checkpoint.
-
-        Args:
-            renderer: Renders any training view with all components of the run.
         """
 
     def allows_view(self, step: Step) -> bool:
@@ -179,7 +147,6 @@ class Component:
             False if the view is excluded. The sampler skips it, and epochs that begin while it is
             excluded do not contain it.
         """
-        del step
         return True
 
     def training_views(
@@ -199,33 +166,20 @@ class Component:
             `views` itself for no change, and the same object as in the last step if nothing has
             changed since: for a new object, training prepares all photographs again.
         """
-        del step
         return views
 
     def before_render(self, activated: ActivatedGaussians, step: Step) -> ActivatedGaussians:
-        """Change the Gaussians for this step's render only.
+        """Change the N Gaussians, scales in world units and opacities in 0..1, for this render.
 
-        Args:
-            activated: N Gaussians with scales in world units and opacities in 0..1.
-            step: The step with its view.
-
-        Returns:
-            The N Gaussians to render, differentiable in `activated`.
+        The result must be differentiable in `activated`.
         """
-        del step
         return activated
 
     def render_camera(self, camera: Camera, step: Step) -> Camera:
-        """Choose the camera for rendering the step's view.
+        """Choose the camera, of any size in px, for rendering the step's view.
 
-        Args:
-            camera: The camera of the view, as the previous components changed it.
-            step: The step with its view.
-
-        Returns:
-            A camera with the same view, of any size in px.
+        `camera` is that of the view, as the previous components changed it.
         """
-        del step
         return camera
 
     def to_photograph(self, image: Tensor, step: Step) -> Tensor:
@@ -241,29 +195,19 @@ class Component:
         Returns:
             The image [H, W, 3] at the photograph's size, linear in `image`.
         """
-        del step
         return image
 
     def match_colors(self, image: Tensor, step: Step) -> Tensor:
         """Map the colours of a render to those of its photograph, by exposure for example.
 
-        Training calls this with gradients enabled for the render of the step, and with gradients
-        disabled for renders of other views that components ask for.
-
-        Args:
-            image: [H, W, 3] after `to_photograph`.
-            step: The step with its view.
-
-        Returns:
-            The image [H, W, 3] for the loss. Each pixel must depend only on the same pixel of
-            `image`.
+        Training calls this after `to_photograph`, with gradients enabled for the render of the
+        step, and with gradients disabled for renders of other views that components ask for. Each
+        pixel of the result must depend only on the same pixel of `image`.
         """
-        del step
         return image
 
     def pixel_weights(self, step: Step) -> Tensor | None:
         """Return weights [H, W] of the pixels in the photometric loss; None if all are 1."""
-        del step
         return None
 
     def modify_loss(self, loss: Tensor, image: Tensor, gaussians: Gaussians, step: Step) -> Tensor:
@@ -279,7 +223,6 @@ class Component:
         Returns:
             The changed loss, a scalar.
         """
-        del image, gaussians, step
         return loss
 
     def needs_backward(self, loss: Tensor, step: Step) -> bool:
@@ -295,40 +238,24 @@ class Component:
             False to skip the backward pass, the optimizer's step and the step's contribution to
             the densification statistics. Schedules, as the learning rate's, go on.
         """
-        del loss, step
         return True
 
     def after_backward(self, gaussians: Gaussians, step: Step) -> None:
         """Change the gradients of the parameters in place, before the optimizer's step.
 
-        Args:
-            gaussians: N Gaussians with their gradients. A change of the gradient of `shN` has no
-                effect: the optimizer computes it from the gradient of `sh0`.
-            step: The step with its view.
+        A change of the gradient of `shN` has no effect: the optimizer computes it from the gradient
+        of `sh0`.
         """
 
     def densification_grad2d(self, grad2d: Tensor, step: Step) -> Tensor:
-        """Change the image-plane gradient for the statistics of densification.
-
-        Args:
-            grad2d: [N, 2] gradient of the loss with respect to the projected means, per px.
-            step: The step with its view.
-
-        Returns:
-            The gradient [N, 2] for densification.
-        """
-        del step
+        """Change the image-plane gradient [N, 2], per px, for the statistics of densification."""
         return grad2d
 
     def densification_groups(self, settings: DensifySettings) -> Groups | None:
         """Return thresholds of growth and pruning for each tag of views; None for common ones.
 
         Training calls this once, before the first step. Only one component may return groups.
-
-        Args:
-            settings: The settings of densification.
         """
-        del settings
         return None
 
     def may_grow(self, gaussians: Gaussians, step: Step) -> Tensor | None:
@@ -339,7 +266,6 @@ class Component:
         Returns:
             [N] bool, or None if all Gaussians may grow.
         """
-        del gaussians, step
         return None
 
     def growth_scores(self, gaussians: Gaussians, step: Step) -> Tensor | None:
@@ -351,7 +277,6 @@ class Component:
         Returns:
             Scores [N], at least 0; None to rank by the mean image-plane gradient.
         """
-        del gaussians, step
         return None
 
     def to_prune(self, gaussians: Gaussians, step: Step) -> Tensor | None:
@@ -363,7 +288,6 @@ class Component:
         Returns:
             [N] bool, True for a Gaussian to remove; None to keep all.
         """
-        del gaussians, step
         return None
 
     def after_step(self, gaussians: Gaussians, step: Step) -> None:
@@ -381,7 +305,6 @@ class Component:
         Returns:
             Factors [N] above 0 and at most 1; None if `before_render` does not change opacities.
         """
-        del gaussians
         return None
 
     def on_gaussians_changed(self, gaussians: Gaussians) -> None:
@@ -404,24 +327,16 @@ class Component:
     def findings(self) -> list[str]:
         """Return lines about the training or the photographs, for the cell's summary.
 
-        Returns:
-            Lines to be printed; each begins with the component's name, as in `floaters: ...`.
+        Each line begins with the component's name, as in `floaters: ...`.
         """
         return []
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the component's state for a checkpoint.
-
-        Returns:
-            Name -> tensor or JSON value; empty if there is no state.
-        """
+        """Return the state for a checkpoint: name -> tensor or JSON value; empty without any."""
         return {}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore a state of `state_dict`.
-
-        Args:
-            state: The state of a component that was built from the same settings; never empty.
+        """Restore the state of a component that was built from the same settings; never empty.
 
         Raises:
             KeyError: An entry is missing.

@@ -58,16 +58,13 @@ class Components(tuple[Component, ...], Component):
     def check_strategy(self, name: str, strategy: type[Strategy]) -> None:
         """Refuse components with growth hooks for a strategy that does not call these hooks.
 
-        Args:
-            name: The strategy's name, `splat.strategy` of the config.
-            strategy: The class of the strategy.
-
         Raises:
-            XrgsError: The message names the components.
+            XrgsError: The message names the components, and the strategy's name.
         """
-        kinds = [type(component) for component in self]
         deciding = [
-            kind.__name__ for kind in kinds if any(_overrides(kind, hook) for hook in _GROWTH)
+            type(component).__name__
+            for component in self
+            if any(_overrides(type(component), hook) for hook in _GROWTH)
         ]
         if deciding and not strategy.asks_components:
             raise XrgsError(
@@ -117,11 +114,6 @@ def _apply(hooks: list[Callable[..., Any]], value: Any, *arguments: Any) -> Any:
     return value
 
 
-def _apply_reversed(hooks: list[Callable[..., Any]], value: Any, *arguments: Any) -> Any:
-    """Pass a value through each hook, the last hook first."""
-    return _apply(hooks[::-1], value, *arguments)
-
-
 def _all(hooks: list[Callable[..., bool]], *arguments: Any) -> bool:
     """Return whether all hooks return True. Every hook is called, since some count their calls."""
     answers = [hook(*arguments) for hook in hooks]
@@ -138,11 +130,6 @@ def _reduce(
     return functools.reduce(combine, answers) if answers else None
 
 
-def _joined(hooks: list[Callable[..., list[str]]]) -> list[str]:
-    """Join the lists of all hooks."""
-    return [line for hook in hooks for line in hook()]
-
-
 #: Hook -> function that combines the components' results.
 _FOLDS: dict[str, Callable[..., Any]] = {
     "before_training": _call,
@@ -150,7 +137,7 @@ _FOLDS: dict[str, Callable[..., Any]] = {
     "training_views": _apply,
     "before_render": _apply,
     "render_camera": _apply,
-    "to_photograph": _apply_reversed,
+    "to_photograph": lambda hooks, *arguments: _apply(hooks[::-1], *arguments),
     "match_colors": _apply,
     "pixel_weights": functools.partial(_reduce, operator.mul),
     "modify_loss": _apply,
@@ -165,13 +152,11 @@ _FOLDS: dict[str, Callable[..., Any]] = {
     "on_gaussians_changed": _call,
     "bake": _call,
     "after_training": _call,
-    "findings": _joined,
+    "findings": lambda hooks: [line for hook in hooks for line in hook()],
 }
 
 
 def _combined(name: str, fold: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the method of `Components` for a hook."""
-
     @functools.wraps(getattr(Component, name))
     def combined(self: Components, *arguments: Any) -> Any:
         return fold([getattr(component, name) for component in self], *arguments)

@@ -72,24 +72,12 @@ class Consistency(Component):
         factor: int,
         backend: str = "torch",
     ) -> None:
-        """Compute the sizes of the paired images, and the paired images that are cached.
-
-        Args:
-            settings: `components.consistency` of the config.
-            views: All training views.
-            factor: How many times smaller an LR view is than an HR view.
-            backend: `torch` or `native`: the implementation of the loss and of the resampling.
-
-        Raises:
-            XrgsError: `lr_mode` is unknown, or a paired image is smaller than the SSIM window.
-        """
         if settings.lr_mode not in _LR_MODES:
             raise XrgsError(
                 f"components.consistency.lr_mode={settings.lr_mode}: must be exact, fold or off"
             )
         self.weight, self.l1, self.ssim = settings.weight, settings.l1, settings.ssim
-        self.lr_mode = settings.lr_mode
-        self.backend = backend
+        self.lr_mode, self.backend = settings.lr_mode, backend
         hr_sides = (
             max(view.camera.width, view.camera.height) for view in views if view.tag == "HR"
         )
@@ -100,7 +88,12 @@ class Consistency(Component):
 
     @classmethod
     def from_settings(cls, settings: ConsistencyConf, setup: TrainingSetup) -> Self | None:
-        """Build the component; a `weight` of 0 leaves it off."""
+        """Build the component; a `weight` of 0 leaves it off.
+
+        Raises:
+            XrgsError: A setting is out of range, `lr_mode` is unknown, or a paired image is smaller
+                than the SSIM window.
+        """
         for name in ("weight", "l1", "ssim"):
             check_not_negative(f"components.consistency.{name}", getattr(settings, name))
         if settings.weight == 0:
@@ -109,7 +102,6 @@ class Consistency(Component):
 
     def modify_loss(self, loss: Tensor, image: Tensor, gaussians: Gaussians, step: Step) -> Tensor:
         """Return `loss + L_cons`, and record L_cons as `consistency.<tag>`."""
-        del gaussians
         consistency = self._consistency_loss(image, step.view)
         if consistency is None:
             return loss

@@ -45,7 +45,7 @@ class Curriculum(Component):
     def from_settings(cls, settings: CurriculumConf, setup: TrainingSetup) -> Self | None:
         """Build the component; an `lr_only` of 0 leaves it off."""
         check_not_negative("components.curriculum.lr_only", settings.lr_only)
-        return None if settings.lr_only == 0 else cls(settings, setup.data.train)
+        return cls(settings, setup.data.train) if settings.lr_only else None
 
     def allows_view(self, step: Step) -> bool:
         """Allow LR views always, and HR views after the warm-up."""

@@ -45,7 +45,6 @@ class Densify(Component):
     """
 
     def __init__(self, settings: DensifyConf) -> None:
-        """Read the factors and `decide` from the settings; XrgsError if `decide` is unknown."""
         if settings.decide not in DECIDE:
             raise XrgsError(
                 f"components.densify.decide={settings.decide}: must be one of shared,"
@@ -56,7 +55,6 @@ class Densify(Component):
     @classmethod
     def from_settings(cls, settings: DensifyConf, setup: TrainingSetup) -> Self | None:
         """Build the component; `decide: shared` leaves it off."""
-        del setup
         check_not_negative("components.densify.lr_grow", settings.lr_grow)
         check_not_negative("components.densify.lr_prune", settings.lr_prune)
         if settings.decide == "own_threshold" and settings.lr_grow == 0:

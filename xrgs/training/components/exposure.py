@@ -58,12 +58,7 @@ class Exposure(Component):
     """
 
     def __init__(self, settings: ExposureConf, views: Sequence[TrainingView]) -> None:
-        """Start with the identity for every view.
-
-        Args:
-            settings: `components.exposure` of the config.
-            views: All training views.
-        """
+        """Start with the identity for every view."""
         self.settings = settings
         self.names = [view.name for view in views]
         of_hr = [at for at, view in enumerate(views) if view.tag == "HR"]
@@ -78,11 +73,7 @@ class Exposure(Component):
 
     @classmethod
     def from_settings(cls, settings: ExposureConf, setup: TrainingSetup) -> Self | None:
-        """Build the component; the mode `none` leaves it off.
-
-        Raises:
-            XrgsError: The mode is unknown, or a setting is out of range.
-        """
+        """Build the component; the mode `none` leaves it off."""
         key = "components.exposure"
         if settings.mode not in ("none", "affine", "gain"):
             raise XrgsError(f"{key}.mode={settings.mode}: must be none, affine or gain")
@@ -109,7 +100,6 @@ class Exposure(Component):
 
     def after_backward(self, gaussians: Gaussians, step: Step) -> None:
         """Update the map of the step's photograph, and reset the mean map to the identity."""
-        del gaussians
         if self.drawn is None or self.drawn.grad is None:
             return
         at, settings = self.names.index(step.view.name), self.settings
@@ -140,14 +130,9 @@ class Exposure(Component):
 
 
 def apply_map(image: Tensor, colors: Tensor) -> Tensor:
-    """Return M c + b for each colour c of an image.
+    """Return M c + b for each colour c of an image [H, W, 3]; `colors` is [M | b], [3, 4].
 
-    Args:
-        image: [H, W, 3].
-        colors: [M | b], [3, 4].
-
-    Returns:
-        [H, W, 3]; once differentiable in both.
+    The result is once differentiable in both.
     """
     mapped: Tensor = _ApplyMap.apply(image, colors)  # type: ignore[no-untyped-call]
     return mapped

@@ -55,14 +55,7 @@ class Floaters(Component):
         points: Tensor,
         densify: DensifySettings,
     ) -> None:
-        """Measure the depths of the SfM points in each view.
-
-        Args:
-            settings: `components.floaters` of the config.
-            views: All training views.
-            points: SfM points [P, 3], world units.
-            densify: The schedule of densification, in steps of a 30,000-step run.
-        """
+        """Measure the depths of the SfM points [P, 3], world units, in each training view."""
         self.settings, self.densify = settings, densify
         self.cameras = {view.name: view.camera for view in views}
         self.near = {name: _near(points, camera) for name, camera in self.cameras.items()}
@@ -72,11 +65,7 @@ class Floaters(Component):
 
     @classmethod
     def from_settings(cls, settings: FloatersConf, setup: TrainingSetup) -> Self | None:
-        """Build the component; a `near_share` of 0 leaves it off.
-
-        Raises:
-            XrgsError: The share is below 0 or not finite.
-        """
+        """Build the component; a `near_share` of 0 leaves it off."""
         check_not_negative("components.floaters.near_share", settings.near_share)
         if settings.near_share == 0:
             return None
@@ -84,9 +73,7 @@ class Floaters(Component):
 
     def to_prune(self, gaussians: Gaussians, step: Step) -> Tensor | None:
         """Return the Gaussians [N] that are too close to a training view; None if not due."""
-        every = self.densify.scaled(step.total).every
-        due = step.number % every == 0 or step.number == step.total - 1
-        if not due:
+        if step.number % self.densify.scaled(step.total).every and step.number < step.total - 1:
             return None
         means = gaussians.means.detach().T.contiguous().T  # each coordinate side by side in memory
         too_near = torch.zeros(len(gaussians), dtype=torch.bool, device=means.device)

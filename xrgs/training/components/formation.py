@@ -46,12 +46,7 @@ class BlurWidths:
     """
 
     def __init__(self, settings: FormationConf, views: Sequence[TrainingView]) -> None:
-        """Start with the box of a pixel.
-
-        Args:
-            settings: `components.formation` of the config.
-            views: The LR training views.
-        """
+        """Start with the box of a pixel for each of the LR training views."""
         self.settings = settings
         shared = settings.widths == "tag"
         self.rows = {view.name: 0 if shared else row for row, view in enumerate(views)}

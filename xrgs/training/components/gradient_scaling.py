@@ -26,13 +26,11 @@ class GradientScaling(Component):
     """
 
     def __init__(self, settings: GradientScalingConf) -> None:
-        """Read alpha, a dimensionless factor, from the settings."""
         self.lr_scale = settings.lr_scale
 
     @classmethod
     def from_settings(cls, settings: GradientScalingConf, setup: TrainingSetup) -> Self | None:
         """Build the component; an `lr_scale` of 1 leaves it off."""
-        del setup
         check_not_negative("components.gradient_scaling.lr_scale", settings.lr_scale)
         return None if settings.lr_scale == 1 else cls(settings)
 

@@ -63,13 +63,7 @@ class Mip(Component):
     """
 
     def __init__(self, settings: MipConf, views: Sequence[TrainingView], near: float) -> None:
-        """Store cameras and masks; `on_gaussians_changed` computes the filter.
-
-        Args:
-            settings: `components.mip` of the config.
-            views: All training views.
-            near: Depth below which a Gaussian is not rendered, world units.
-        """
+        """Store cameras and masks; `near` is the depth below which nothing is rendered."""
         self.strength, self.every = settings.variance, settings.every
         self.cameras = [view.camera for view in views]
         self.masks = [view.mask for view in views]
@@ -79,11 +73,7 @@ class Mip(Component):
 
     @classmethod
     def from_settings(cls, settings: MipConf, setup: TrainingSetup) -> Self | None:
-        """Build the component; a `variance` of 0 leaves it off.
-
-        Raises:
-            XrgsError: A setting is out of its range.
-        """
+        """Build the component; a `variance` of 0 leaves it off."""
         check_not_negative("components.mip.variance", settings.variance)
         if settings.every < 1:
             raise XrgsError(f"components.mip.every={settings.every}: must be at least 1")
@@ -171,18 +161,11 @@ def smooth(scales: Tensor, opacities: Tensor, variance: Tensor) -> tuple[Tensor,
 def sampling_rates(
     means: Tensor, cameras: Sequence[Camera], near: float, masks: Sequence[Tensor | None] = ()
 ) -> Tensor:
-    """Compute the highest sampling rate of each point among the views that see it.
+    """Compute the highest sampling rate of each point [N, 3] among the views that see it.
 
-    A view sees a point if its depth is above `near`, its projection lies inside the image or within
-    15% of the image's size outside it, and the nearest pixel is used by the view's mask. The rate
-    is the larger of fx and fy over the depth.
-
-    Args:
-        means: [N, 3] points, world units.
-        cameras: The cameras of the views.
-        near: Depth below which a point is not seen, world units.
-        masks: The masks of the views [H, W] bool, None for a view without a mask; empty if no view
-            has a mask.
+    A view sees a point if its depth is above `near`, world units, its projection lies inside the
+    image or within 15% of the image's size outside it, and the nearest pixel is used by the view's
+    mask [H, W], if it has one. The rate is the larger of fx and fy over the depth.
 
     Returns:
         [N] rates in px per world unit, 0 if no view sees the point.

@@ -67,13 +67,7 @@ class NaturalSelection(Component):
     """
 
     def __init__(self, settings: NaturalSelectionConf, budget: int, stop: int) -> None:
-        """Set the schedule.
-
-        Args:
-            settings: `components.natural_selection` of the config.
-            budget: The number of Gaussians to keep.
-            stop: Step of a 30,000-step run at which densification ends.
-        """
+        """Keep `budget` Gaussians, from step `stop` of a 30,000-step run on."""
         self.budget, self.start, self.until = budget, stop, settings.until
         self.drop_every = settings.drop_every
         self.push = 0.0
@@ -122,7 +116,8 @@ class NaturalSelection(Component):
             self.first_opacity = _START * self._last_survivors_opacity(gaussians)
         elif _is_due(step, _ADJUST_EVERY):
             last = self._last_survivors_opacity(gaussians)
-            goal = self.first_opacity * self._share_left(step)
+            passed = (step.nominal - self.start) / (self.until - _LEAD - self.start)
+            goal = self.first_opacity * max(0.0, 1 - passed)
             if last < (1 - _TOLERANCE) * goal:
                 self.push *= _LESS
             elif last > (1 + _TOLERANCE) * goal:
@@ -157,11 +152,6 @@ class NaturalSelection(Component):
         rank = len(gaussians) - self.budget + 1  # from the most transparent one, 1
         logit = gaussians.opacities.detach().kthvalue(rank).values.item()
         return 1 / (1 + math.exp(-logit))
-
-    def _share_left(self, step: Step) -> float:
-        """Return the path's opacity at a step, as a fraction of its first value."""
-        done = (step.nominal - self.start) / (self.until - _LEAD - self.start)
-        return max(0.0, 1 - done)
 
 
 def _is_due(step: Step, every: int) -> bool:

@@ -28,23 +28,17 @@ class Regularization(Component):
     """
 
     def __init__(self, settings: RegularizationConf, backend: str) -> None:
-        """Store the weights, and the backend of the activation functions."""
         self.settings, self.backend = settings, backend
 
     @classmethod
     def from_settings(cls, settings: RegularizationConf, setup: TrainingSetup) -> Self | None:
-        """Build the component; it is off if both weights are 0.
-
-        Raises:
-            XrgsError: A weight is below 0.
-        """
+        """Build the component; it is off if both weights are 0."""
         for name in ("opacity", "scale"):
             check_not_negative(f"components.regularization.{name}", getattr(settings, name))
         return cls(settings, setup.backend) if settings.opacity or settings.scale else None
 
     def modify_loss(self, loss: Tensor, image: Tensor, gaussians: Gaussians, step: Step) -> Tensor:
         """Add the penalties; `regularization.opacity` and `.scale` record the means."""
-        del image
         activated = gaussians.activated(backend=self.backend)
         for name, values in (("opacity", activated.opacities), ("scale", activated.scales)):
             if weight := getattr(self.settings, name):

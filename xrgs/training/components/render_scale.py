@@ -37,9 +37,10 @@ class RenderScale(Component):
 
     def __init__(self, settings: RenderScaleConf, views: Sequence[TrainingView]) -> None:
         """Compute k of each LR view among all training views."""
-        largest = max(_long_side(view) for view in views)
+        sides = {view.name: max(view.camera.width, view.camera.height) for view in views}
+        largest = max(sides.values())
         self.factors = {
-            view.name: (largest / _long_side(view)) ** settings.gamma
+            view.name: (largest / sides[view.name]) ** settings.gamma
             for view in views
             if view.tag == "LR"
         }
@@ -57,8 +58,3 @@ class RenderScale(Component):
             return activated
         step.log["render_scale.k"] = factor
         return activated._replace(scales=activated.scales * factor)
-
-
-def _long_side(view: TrainingView) -> int:
-    """The longer side of a view, px."""
-    return max(view.camera.width, view.camera.height)

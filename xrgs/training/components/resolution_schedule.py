@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Self, cast
+from typing import TYPE_CHECKING, Self
 
 import torch
 from torch import Tensor
@@ -17,7 +17,6 @@ from xrgs.training.components.base import Component, Step, TrainingSetup, Traini
 
 if TYPE_CHECKING:
     from xrgs.config import ResolutionScheduleConf
-    from xrgs.training.dataset import LoadedView
 
 _LARGEST_FACTOR = 8
 """Largest factor of downsampling, as in the authors' code."""
@@ -62,24 +61,13 @@ class ResolutionSchedule(Component):
         views: Sequence[TrainingView],
         backend: str = "torch",
     ) -> None:
-        """Compute the fraction of the spectrum that remains at each factor.
-
-        Args:
-            settings: `components.resolution_schedule` of the config.
-            views: All training views; the HR views are reduced.
-            backend: `torch` or `native`: the implementation of the resampling.
-
-        Raises:
-            XrgsError: No view is tagged HR.
-        """
         high = [view for view in views if view.tag == "HR"]
         if not high:
             raise XrgsError(
                 "components.resolution_schedule: there is no HR view to reduce; set start_share to"
                 " 1, or train on the mixed views (train.views=mixed)"
             )
-        self.settings = settings
-        self.backend = backend
+        self.settings, self.backend = settings, backend
         shortest = min(min(view.camera.width, view.camera.height) for view in high)
         largest = min(_LARGEST_FACTOR, max(1, shortest // WINDOW))
         self.kept = kept_shares((view.image for view in high), range(1, largest + 1))
@@ -117,13 +105,11 @@ class ResolutionSchedule(Component):
             self.factor, self.reduced = 1, {}
             return views
         if factor != self.factor:
-            self.factor, self.reduced = (
-                factor,
-                {
-                    name: self._reduce(view, factor) if view.tag == "HR" else view
-                    for name, view in views.items()
-                },
-            )
+            self.factor = factor
+            self.reduced = {
+                name: self._reduce(view, factor) if view.tag == "HR" else view
+                for name, view in views.items()
+            }
         return self.reduced
 
     def factor_at(self, step: Step) -> int:
@@ -141,7 +127,7 @@ class ResolutionSchedule(Component):
         if view.mask is not None:
             resized = masks.resized(view.mask.cpu().numpy(), width, height)
             mask = torch.from_numpy(resized).to(view.mask.device)
-        return replace(cast("LoadedView", view), camera=camera, pixels=image, mask=mask)
+        return replace(view, camera=camera, pixels=image, mask=mask)
 
 
 def kept_shares(images: Iterable[Tensor], factors: Iterable[int]) -> dict[int, float]:

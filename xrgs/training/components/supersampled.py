@@ -70,18 +70,11 @@ class Supersampled(Component):
         *,
         blur: FormationConf,
     ) -> None:
-        """Choose the kernels D, and log how many views have each k.
+        """Choose the kernels D.
 
-        Args:
-            settings: `components.supersampled` of the config.
-            views: All training views.
-            degradation: How LR views were made, `Dataset.degradation`.
-            zoom: Factor of the digital zoom: size of a photograph over its resolution.
-            backend: `torch` or `native`: the implementation of the resampling.
-            blur: `components.formation` of the config.
+        `zoom` is the factor of the digital zoom: size of a photograph over its resolution.
         """
-        self.settings = settings
-        self.backend = backend
+        self.settings, self.backend = settings, backend
         self.shrinks = degradation not in ("jpeg", "none")
         """Whether the degradation reduces the resolution of LR views."""
         self.zoom = zoom if degradation == "digital_zoom" else 1
@@ -112,7 +105,7 @@ class Supersampled(Component):
     def render_camera(self, camera: Camera, step: Step) -> Camera:
         """Return the camera at k times the photograph's resolution."""
         factor = self._factor(step)
-        if factor == 1 and not self._is_blurred(step):
+        if factor == 1 and self._blur_of(step) is None:
             return camera
         step.log["supersampled.factor"] = factor
         small = self._resolved(camera, step)
@@ -120,7 +113,7 @@ class Supersampled(Component):
 
     def to_photograph(self, image: Tensor, step: Step) -> Tensor:
         """Downsample the render [kH, kW, 3] of a view to its photograph's size [H, W, 3]."""
-        factor, blur = self._factor(step), self.blur if self._is_blurred(step) else None
+        factor, blur = self._factor(step), self._blur_of(step)
         if factor == 1 and blur is None:
             return image
         if blur is None and not (self.shrinks and step.view.tag == "LR"):
@@ -135,13 +128,22 @@ class Supersampled(Component):
 
     def after_backward(self, gaussians: Gaussians, step: Step) -> None:
         """Update the blur widths of the step's photograph."""
-        del gaussians
         if self.blur is not None:
             self.blur.learn(step)
 
     def findings(self) -> list[str]:
         """Return lines with the number of views for each k, and the trained blur widths."""
-        return [self._factors(), *(self.blur.findings() if self.blur is not None else ())]
+        settings = self.settings
+        early, late = (
+            ", ".join(f"{count} at {k}" for k, count in sorted(counts.items()))
+            for counts in (
+                Counter(_clamped(need, factor) for need in self.needs)
+                for factor in (settings.factor, settings.late_factor)
+            )
+        )
+        later = "" if late == early else f"; from step {settings.late_from} on {late}"
+        line = f"supersampled: views at k times their size: {early}{later}"
+        return [line, *(self.blur.findings() if self.blur is not None else ())]
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state of the blur; empty without one."""
@@ -154,31 +156,18 @@ class Supersampled(Component):
 
     def _factor(self, step: Step) -> int:
         """Return k of the step's view."""
-        late = step.nominal >= self.settings.late_from
         settings = self.settings
+        late = step.nominal >= settings.late_from
         return _clamped(step.view.supersampling, settings.late_factor if late else settings.factor)
 
-    def _is_blurred(self, step: Step) -> bool:
-        return self.blur is not None and step.view.tag == "LR"
+    def _blur_of(self, step: Step) -> BlurWidths | None:
+        return self.blur if step.view.tag == "LR" else None
 
     def _resolved(self, camera: Camera, step: Step) -> Camera:
         """Return the camera at the resolution of the photograph, smaller than it after a zoom."""
         if self.zoom == 1 or step.view.tag == "HR":
             return camera
         return camera.resized(camera.width // self.zoom, camera.height // self.zoom)
-
-    def _factors(self) -> str:
-        """Return a text: the number of views for each k, first and, if different, late."""
-        settings = self.settings
-        early, late = (
-            ", ".join(f"{count} at {k}" for k, count in sorted(counts.items()))
-            for counts in (
-                Counter(_clamped(need, factor) for need in self.needs)
-                for factor in (settings.factor, settings.late_factor)
-            )
-        )
-        later = "" if late == early else f"; from step {settings.late_from} on {late}"
-        return f"supersampled: views at k times their size: {early}{later}"
 
 
 def _clamped(need: float, factor: int) -> int:

@@ -30,7 +30,7 @@ from xrgs.training.components.texture import gradient_magnitude, mean_gradient
 from xrgs.training.memory import OnDemand
 
 if TYPE_CHECKING:
-    from xrgs.config import ComponentsConf, LossWeightingConf
+    from xrgs.config import LossWeightingConf
     from xrgs.splat.cameras import Camera
     from xrgs.splat.gaussians import Gaussians
 
@@ -75,17 +75,13 @@ class Weighting(Component):
         *,
         stat_from: str = "weighted",
     ) -> None:
-        """Combine a weight with its attenuations.
+        """Combine a weight with its attenuations, all of them in 0..1.
 
         Args:
-            view_weight: Returns the lowest weight of a view, in 0..1.
-            attenuations: Functions that return an attenuation at a step, in 0..1.
-            regions: View name -> attenuations of its pixels [H, W], in 0..1.
-            stat_from: `weighted`, or `unweighted` for image-plane gradients without weights in
-                densification.
-
-        Raises:
-            XrgsError: `stat_from` has another value.
+            view_weight: Returns the lowest weight of a view.
+            attenuations: Functions that return an attenuation at a step.
+            regions: View name -> attenuations of its pixels [H, W].
+            stat_from: `weighted`, or `unweighted` for densification without the weights.
         """
         if stat_from not in _STATISTICS:
             raise XrgsError(
@@ -108,15 +104,29 @@ class Weighting(Component):
             XrgsError: A setting is out of range, or attenuates weights that are all 1.
         """
         conf, data = setup.components, setup.data
-        _check_ranges(conf)
-        view_weight: ViewWeight
-        if conf.continuous_weighting.gamma != 0:  # it replaces the weight by tag
-            view_weight = partial(weight_by_sampling_rate, gamma=conf.continuous_weighting.gamma)
-        elif settings.lr_weight != 1:
-            view_weight = partial(weight_by_tag, lr_weight=settings.lr_weight)
-        else:
-            _check_no_attenuation(conf)
+        gamma = conf.continuous_weighting.gamma
+        check_not_negative("components.loss_weighting.lr_weight", settings.lr_weight)
+        check_not_negative("components.continuous_weighting.gamma", gamma)
+        off = gamma == 0 and settings.lr_weight == 1
+        for key, value in (
+            ("components.adaptive_weighting.texture", conf.adaptive_weighting.texture),
+            ("components.region_weighting.texture", conf.region_weighting.texture),
+            ("components.hybrid_schedule.ramp", conf.hybrid_schedule.ramp),
+        ):
+            check_not_negative(key, value)
+            if off and value != 0:
+                raise XrgsError(
+                    f"{key}={value}: this raises the weight of LR views, which is 1 already; set"
+                    " components.loss_weighting.lr_weight or components.continuous_weighting.gamma"
+                    " too"
+                )
+        if off:
             return None
+        view_weight: ViewWeight = (
+            partial(weight_by_sampling_rate, gamma=gamma)  # it replaces the weight by tag
+            if gamma != 0
+            else partial(weight_by_tag, lr_weight=settings.lr_weight)
+        )
         attenuations: list[Attenuation] = []
         if conf.adaptive_weighting.texture != 0:
             of_scene = scene_attenuation(data.train, conf.adaptive_weighting.texture)
@@ -148,7 +158,6 @@ class Weighting(Component):
 
     def modify_loss(self, loss: Tensor, image: Tensor, gaussians: Gaussians, step: Step) -> Tensor:
         """Return `loss * weight`, or `loss` itself if the weight is 1."""
-        del image, gaussians
         weight = self.weight(step)
         if self.view_weight(step.view) != 1:
             step.log[f"weighting.{step.view.tag}"] = weight
@@ -180,10 +189,6 @@ def weight_by_tag(view: TrainingView, lr_weight: float) -> float:
     Our choice where the paper is silent: densification reads the gradients of the weighted loss
     (`stat_from: weighted`), following the formula. With `stat_from: unweighted` it reads the
     gradients without the weight, which does not work for a weight of 0.
-
-    Args:
-        view: The view.
-        lr_weight: Weight of an LR view.
     """
     return lr_weight if view.tag == "LR" else 1.0
 
@@ -200,10 +205,6 @@ def weight_by_sampling_rate(view: TrainingView, gamma: float) -> float:
     weighting scheme" and gives no formula. The power law is ours. gamma = 0.86, log 4 / log 5,
     gives an LR view at factor 5 the paper's weight of 0.25. (For a power of the number of pixels,
     which is proportional to rho squared, gamma would be 0.43.)
-
-    Args:
-        view: The view.
-        gamma: The exponent.
     """
     return float(view.sampling_rate**gamma)
 
@@ -220,11 +221,7 @@ def scene_attenuation(views: Sequence[TrainingView], texture: float) -> float:
     low-frequency", without a measure or weights. Measure, ramp and threshold are ours. `texture` of
     0.07 is between g of the LLFF scenes that the paper calls cluttered (fern, flower, horns: 0.074
     to 0.12 at factor 5 of 504 and 1008 px) and of the simple ones (fortress 0.055; a single object
-    0.03 to 0.04).
-
-    Args:
-        views: All training views.
-        texture: Intensity per px, above 0.
+    0.03 to 0.04). It is an intensity per px.
     """
     magnitudes = [mean_gradient(v.image, v.mask) for v in views if v.tag == "LR"]
     mean = sum(magnitudes) / len(magnitudes) if magnitudes else 0.0
@@ -239,12 +236,8 @@ def scheduled_attenuation(step: Step, start: float, ramp: float) -> float:
 
     Our choice where the paper is silent: section 7.2 proposes to "reintroduce LR influence in late
     training stages" and names no step. We start at the end of densification: from then on LR views
-    can refine the Gaussians that HR views have shaped, but can't create new ones.
-
-    Args:
-        step: The step.
-        start: Step of a 30,000-step run at which densification stops.
-        ramp: Number of steps of a 30,000-step run, above 0.
+    can refine the Gaussians that HR views have shaped, but can't create new ones. `start` and
+    `ramp` are in steps of a 30,000-step run.
     """
     return 1 - min(1.0, max(0.0, (step.nominal - start) / ramp))
 
@@ -261,13 +254,7 @@ def region_attenuations(
     Our choice where the paper is silent: section 7.2 proposes "spatially varying loss/gradient
     scaling so smooth regions retain LR supervision while textured regions benefit from XR-GS
     attenuation". The measure, its window and the condition of coverage are ours; `texture` is 0.07
-    as in adaptive weighting.
-
-    Args:
-        views: All training views.
-        points: [P, 3] SfM points, world units.
-        texture: Intensity per px, above 0.
-        near: Depth below which a point is not seen, world units.
+    per px as in adaptive weighting. `points` and `near` are as for `coverage`.
 
     Returns:
         Name of each LR view -> attenuations [H, W] in 0..1.
@@ -375,30 +362,3 @@ def _box_mean(values: Tensor, mask: Tensor | None = None) -> Tensor:
     )
     mean: Tensor = pooled[0, 0]
     return mean
-
-
-def _attenuating_settings(conf: ComponentsConf) -> dict[str, float]:
-    """Return key -> setting, of the settings that attenuate a view's weight; 0 means off."""
-    return {
-        "components.adaptive_weighting.texture": conf.adaptive_weighting.texture,
-        "components.region_weighting.texture": conf.region_weighting.texture,
-        "components.hybrid_schedule.ramp": conf.hybrid_schedule.ramp,
-    }
-
-
-def _check_ranges(conf: ComponentsConf) -> None:
-    check_not_negative("components.loss_weighting.lr_weight", conf.loss_weighting.lr_weight)
-    gamma = conf.continuous_weighting.gamma
-    check_not_negative("components.continuous_weighting.gamma", gamma)
-    for key, value in _attenuating_settings(conf).items():
-        check_not_negative(key, value)
-
-
-def _check_no_attenuation(conf: ComponentsConf) -> None:
-    """Refuse attenuations, which would have no effect: every view has weight 1."""
-    for key, value in _attenuating_settings(conf).items():
-        if value != 0:
-            raise XrgsError(
-                f"{key}={value}: this raises the weight of LR views, which is 1 already; set"
-                " components.loss_weighting.lr_weight or components.continuous_weighting.gamma too"
-            )

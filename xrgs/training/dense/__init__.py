@@ -54,7 +54,7 @@ _log = logging.getLogger(__name__)
 def dense_start(
     data: Dataset, sparse: Gaussians, backend: str, generator: torch.Generator
 ) -> Gaussians:
-    """Add Gaussians on the surfaces of a scene to those on its SfM points.
+    """Add Gaussians on the surfaces of a scene to those on its SfM points, `sparse`.
 
     Args:
         data: The training views and the SfM points.
@@ -84,7 +84,6 @@ def dense_start(
 
 
 def _off(sparse: Gaussians, why: str, least: float) -> Gaussians:
-    """Log why there is no dense start, and return the Gaussians on the SfM points."""
     _log.warning(
         "splat.init=dense: off, since only %s, and at least %.0f%% are needed: training starts from"
         " the SfM points",

@@ -21,14 +21,8 @@ class _Comparison:
     """Compares points of one view with the depth map of another; all arrays are [P]."""
 
     def __init__(self, points: Doubles, step: float, other: DepthMap) -> None:
-        """Project the points.
-
-        Args:
-            points: [P, 3] world units.
-            step: Difference of inverse depth between two planes of the view with the points.
-            other: Depth map of the other view.
-        """
-        x, y, depth = other.level.project(points)
+        """Project points [P, 3], world units, of a view whose planes are `step` apart."""
+        x, y, depth = other.view.finest.project(points)
         height, width = other.good.shape
         inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)  # false for nan
         row, column = (np.where(inside, place, 0).astype(np.int64) for place in (y, x))
@@ -46,15 +40,13 @@ def good_points(depths: DepthMap) -> Doubles:
     row, column = np.nonzero(depths.good)
     depth = 1 / depths.inverse_depth[row, column].astype(np.float64)
     x, y = (axis.astype(np.float64) + 0.5 for axis in (column, row))
-    return depths.level.to_world(x, y, depth)
+    return depths.view.finest.to_world(x, y, depth)
 
 
 def consistent(maps: Mapping[int, DepthMap], number: int) -> Bools:
     """Return the good pixels [h, w] of a view whose depth agrees with `AGREEING` neighbours.
 
-    Args:
-        maps: Number of a view -> its depths.
-        number: Number of the view to check.
+    `maps` has the depths of the views by their numbers.
     """
     own = maps[number]
     points = good_points(own)
@@ -66,12 +58,7 @@ def consistent(maps: Mapping[int, DepthMap], number: int) -> Bools:
 
 
 def not_seen_through(maps: Mapping[int, DepthMap], number: int) -> Bools:
-    """Return the good pixels [h, w] with more views of the same depth than that see through.
-
-    Args:
-        maps: Number of a view -> its depths.
-        number: Number of the view to check.
-    """
+    """Return the good pixels [h, w] with more views of the same depth than that see through."""
     own = maps[number]
     points = good_points(own)
     balance = np.zeros(len(points), np.int64)
@@ -84,14 +71,7 @@ def not_seen_through(maps: Mapping[int, DepthMap], number: int) -> Bools:
 
 
 def owned(maps: Sequence[DepthMap]) -> list[Bools]:
-    """Assign each place of the scene to the first view that shows it at a good pixel.
-
-    Args:
-        maps: The depths of all views, in the order of precedence.
-
-    Returns:
-        For each view, its good pixels [h, w] that no earlier view shows.
-    """
+    """Return for each view its good pixels [h, w] that no earlier view shows."""
     result = []
     for place, own in enumerate(maps):
         points = good_points(own)

@@ -71,18 +71,9 @@ class DepthMap:
     neighbours: list[int]
     """Numbers of the views that the sweep compared."""
 
-    @property
-    def level(self) -> Level:
-        """The view at the resolution of the depths."""
-        return self.view.finest
-
 
 def choose_planes(views: Sequence[SweptView], points: Doubles) -> dict[int, Planes]:
-    """Choose the planes and neighbours of each view.
-
-    Args:
-        views: The views.
-        points: SfM points [P, 3], world units.
+    """Choose the planes and neighbours of each view, by the SfM points [P, 3], world units.
 
     Returns:
         Number of a view -> its planes. Views that can't be swept are missing: too few points are in
@@ -140,14 +131,7 @@ def _displacement(level: Level, others: Sequence[Level], far: float, near: float
 def sweep(
     views: Sequence[SweptView], planes: Planes, number: int, backend: str = "torch"
 ) -> DepthMap:
-    """Find the depths of one view.
-
-    Args:
-        views: All views.
-        planes: The planes of the view.
-        number: Number of the view.
-        backend: `native` for the compiled kernels, which give the same bits; else numpy.
-    """
+    """Find the depths of one view, `views[number]`, by its planes; `backend` as for `costs`."""
     view, nearest = views[number], planes.neighbours[:NEIGHBOURS]
     inverse_depths = planes.inverse_depths[:, None, None]
     volume = costs(view.coarse, [views[n].coarse for n in nearest], inverse_depths, backend)
@@ -184,9 +168,7 @@ def _refined(
 def evened(image: Floats, range_: np.float32) -> Floats:
     """Smooth an image [h, w] by the mean of each pixel's window, without blurring edges.
 
-    Args:
-        image: [h, w]
-        range_: Largest difference from the pixel's value; other values of the window are ignored.
+    Values of the window that differ by more than `range_` from the pixel's are ignored.
     """
     height, width = image.shape
     total, number = np.zeros_like(image), np.zeros_like(image)

@@ -112,26 +112,18 @@ def swept_views(views: tuple[TrainingView, ...], backend: str) -> list[SweptView
 
     The coarse levels of all views have the same longer side: that of the smallest view, but at most
     a quarter of that of the largest view. A sufficiently larger view also has a fine level, of half
-    its size.
-
-    Args:
-        views: The training views.
-        backend: `torch` or `native`: the implementation of resampling.
+    its size. `backend`, `torch` or `native`, resamples.
     """
     sides = [max(view.camera.width, view.camera.height) for view in views]
     coarse = min(*sides, max(max(sides) // LEAST_SHRINK, 1))
-    swept = []
-    for view, side in zip(views, sides, strict=True):
-        fine = side // 2
-        has_fine = fine >= _FINER * coarse
-        swept.append(
-            SweptView(
-                view,
-                _level(view, coarse / side, backend),
-                _level(view, fine / side, backend) if has_fine else None,
-            )
+    return [
+        SweptView(
+            view,
+            _level(view, coarse / side, backend),
+            _level(view, side // 2 / side, backend) if side // 2 >= _FINER * coarse else None,
         )
-    return swept
+        for view, side in zip(views, sides, strict=True)
+    ]
 
 
 def _level(view: TrainingView, scale: float, backend: str) -> Level:
@@ -148,7 +140,9 @@ def _level(view: TrainingView, scale: float, backend: str) -> Level:
     K = camera.K.double().numpy()
     return Level(
         ((red + green + blue) / 3).contiguous().numpy(),
-        _used(view, height, width),
+        np.ones((height, width), bool)
+        if view.mask is None
+        else resized(view.mask.numpy(), height, width),
         rotation,
         offset,
         stretch * K[[0, 1], [0, 1]],
@@ -156,13 +150,11 @@ def _level(view: TrainingView, scale: float, backend: str) -> Level:
     )
 
 
-def _used(view: TrainingView, height: int, width: int) -> Bools:
-    if view.mask is None:
-        return np.ones((height, width), bool)
-    mask = view.mask.numpy()
+def resized(mask: Bools, height: int, width: int) -> Bools:
+    """Return a mask [h, w] at the size [height, width], of the nearest pixels."""
     rows, columns = (
         ((np.arange(new) + 0.5) * old / new).astype(np.int64)
         for old, new in zip(mask.shape, (height, width), strict=True)
     )
-    used: Bools = mask[rows[:, None], columns]
-    return used
+    result: Bools = mask[rows[:, None], columns]
+    return result

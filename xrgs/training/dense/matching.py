@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -26,11 +26,7 @@ class Windows:
     """The 5 x 5 px windows of an image, for correlation with those of other images."""
 
     def __init__(self, image: Floats) -> None:
-        """Compute the moments of the windows.
-
-        Args:
-            image: [h, w] in 0..1.
-        """
+        """Compute the moments of the windows of an image [h, w] in 0..1."""
         # Centred on mid-gray, which reduces rounding errors of the variances.
         self.image = image - np.float32(0.5)
         self.share: Floats = np.float32(1) / box_sum(np.ones_like(image))
@@ -97,9 +93,25 @@ def costs(
     windows, paths = Windows(level.gray), [_Path(level, other) for other in others]
     result = np.empty((len(inverse_depths), *size), np.float32)
     if backend == "native":
-        _native_costs(windows, paths, inverse_depths, result)
+        from xrgs import _native  # not built where the backend is torch
+
+        everywhere = np.empty((0, 0), bool)
+        _native.plane_sweep_costs(
+            [windows.image, windows.share, windows.mean, windows.variance],
+            [np.stack(path.directions) for path in paths],
+            [path.shift for path in paths],
+            [path.image for path in paths],
+            [everywhere if path.other.used.all() else path.other.used for path in paths],
+            inverse_depths,
+            min(BEST, len(paths)),
+            float(_NOISE),
+            float(_BEHIND),
+            result,
+        )
         return result
-    for part in _parts(len(inverse_depths), size[0] * size[1]):
+    step = max(1, _CHUNK // (size[0] * size[1]))
+    for start in range(0, len(inverse_depths), step):
+        part = slice(start, start + step)
         highest = [np.zeros_like(result[part]) for _ in range(min(BEST, len(others)))]
         for path in paths:
             image, inside = path.sample(inverse_depths[part])
@@ -108,38 +120,8 @@ def costs(
                 lower = np.minimum(best, score)
                 np.maximum(best, score, out=best)
                 score = lower
-        total = highest[0]
-        for best in highest[1:]:
-            total += best
-        result[part] = 1 - total / len(highest)
+        result[part] = 1 - sum(highest[1:], highest[0]) / len(highest)
     return result
-
-
-def _native_costs(
-    windows: Windows, paths: Sequence[_Path], inverse_depths: Floats, result: Floats
-) -> None:
-    """Write the costs [D, h, w] to `result`."""
-    from xrgs import _native  # not built where the backend is torch
-
-    everywhere = np.empty((0, 0), bool)
-    _native.plane_sweep_costs(
-        [windows.image, windows.share, windows.mean, windows.variance],
-        [np.stack(path.directions) for path in paths],
-        [path.shift for path in paths],
-        [path.image for path in paths],
-        [everywhere if path.other.used.all() else path.other.used for path in paths],
-        inverse_depths,
-        min(BEST, len(paths)),
-        float(_NOISE),
-        float(_BEHIND),
-        result,
-    )
-
-
-def _parts(count: int, pixels: int) -> Iterator[slice]:
-    step = max(1, _CHUNK // pixels)
-    for start in range(0, count, step):
-        yield slice(start, min(start + step, count))
 
 
 class _Path:

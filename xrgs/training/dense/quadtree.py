@@ -35,12 +35,9 @@ class Quadtree:
     """All squares of one photograph's chosen pixels, of every size from a single pixel."""
 
     def __init__(self, image: Floats, chosen: Bools, weight: float) -> None:
-        """Compute the errors of all squares.
+        """Compute the errors of all squares of an image [H, W, 3] in 0..1, times `weight`.
 
-        Args:
-            image: [H, W, 3] in 0..1.
-            chosen: [H, W] bool, the P pixels that count.
-            weight: Factor of the errors of this photograph.
+        Only the P pixels count that are `chosen` [H, W].
         """
         self.rows, self.columns = (axis.astype(np.int64) for axis in np.nonzero(chosen))
         self.colors = image[chosen].astype(np.float64)

@@ -21,12 +21,8 @@ def smoothed(costs: Floats, backend: str = "torch") -> Floats:
 
     where m is the minimum of L(p', .) over the depths.
 
-    Args:
-        costs: C [D, h, w].
-        backend: As for `costs`.
-
     Returns:
-        [D, h, w] the sum of L over the four directions.
+        The sum of L over the four directions, [D, h, w] as `costs`.
     """
     both_ways = _native_both_ways if backend == "native" else _both_ways
     by_column = both_ways(np.ascontiguousarray(costs.transpose(2, 0, 1)))  # [w, D, h]
@@ -71,13 +67,9 @@ def _next(path: Floats, costs: Floats) -> Floats:
 
 
 def minimum(costs: Floats) -> Floats:
-    """Return the plane of the least cost of each pixel, interpolated by a parabola.
+    """Return the plane of each pixel's least cost [D, h, w], interpolated by a parabola.
 
-    Args:
-        costs: [D, h, w], at least 3 planes.
-
-    Returns:
-        [h, w] in 0..D - 1.
+    There are at least 3 planes; the result [h, w] is in 0..D - 1.
     """
     planes = len(costs)
     place = costs.argmin(axis=0)

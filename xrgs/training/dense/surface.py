@@ -13,7 +13,7 @@ from xrgs.runtime.machine import single_torch_thread
 from xrgs.runtime.progress import progress
 from xrgs.training.dense.checks import consistent, not_seen_through, owned
 from xrgs.training.dense.depths import DepthMap, choose_planes, sweep
-from xrgs.training.dense.levels import Bools, Doubles, SweptView
+from xrgs.training.dense.levels import Doubles, SweptView, resized
 from xrgs.training.dense.quadtree import Quadtree, limit_for
 
 _CELLS = 24
@@ -37,11 +37,6 @@ def find_depths(
 ) -> dict[int, DepthMap]:
     """Sweep every view, and check its depths against those of the other views.
 
-    Args:
-        views: The training views.
-        points: SfM points [P, 3], world units.
-        backend: As for `sweep`.
-
     Returns:
         Number of a view -> its depths. Views that can't be swept are missing.
     """
@@ -60,47 +55,34 @@ def find_depths(
 
 
 def cover(maps: Sequence[DepthMap], budget: int) -> Squares:
-    """Cover the good pixels of all views with squares, each place of the scene once.
+    """Cover the good pixels of all views, at least one, with squares, each place once.
 
     A place is assigned to the view with the highest sampling rate that shows it at a good pixel.
-    The squares are the leaves of quadtrees, which are split where colours differ most.
-
-    Args:
-        maps: The depths of the views, with at least one good pixel among them.
-        budget: Largest number of squares. The quadtrees' largest squares may exceed it.
+    The squares are the leaves of quadtrees, which are split where colours differ most. There are at
+    most `budget`, unless the quadtrees' largest squares exceed it.
     """
     ordered = sorted(maps, key=lambda each: -each.view.photograph.sampling_rate)
     of_views = zip(ordered, owned(ordered), strict=True)
     having = [(each, pixels) for each, pixels in of_views if pixels.any()]
-    focal = [each.view.photograph.camera.numbers.intrinsics[0] for each, _ in having]
+    cameras = [each.view.photograph.camera for each, _ in having]
+    focal = [camera.numbers.intrinsics[0] for camera in cameras]
     trees = [
         Quadtree(
             each.view.photograph.image.numpy(),
-            _on_photograph(each, pixels),
+            resized(pixels, camera.height, camera.width),
             # Weighted by a pixel's solid angle, so that coarse views are split too.
             weight=(max(focal) / own) ** 2,
         )
-        for (each, pixels), own in zip(having, focal, strict=True)
+        for (each, pixels), camera, own in zip(having, cameras, focal, strict=True)
     ]
     limit = limit_for(trees, budget)
     parts = [_squares(each, tree, limit) for (each, _), tree in zip(having, trees, strict=True)]
     return Squares(*(np.concatenate(values) for values in zip(*parts, strict=True)))
 
 
-def _on_photograph(depths: DepthMap, pixels: Bools) -> Bools:
-    """Enlarge a mask [h, w] of a view's finest level to the size of its photograph."""
-    camera = depths.view.photograph.camera
-    rows, columns = (
-        ((np.arange(new) + 0.5) * old / new).astype(np.int64)
-        for new, old in zip((camera.height, camera.width), pixels.shape, strict=True)
-    )
-    enlarged: Bools = pixels[rows[:, None], columns]
-    return enlarged
-
-
 def _squares(depths: DepthMap, tree: Quadtree, limit: float) -> tuple[Doubles, Doubles, Doubles]:
     """Return points, colours and sides of the leaves of a view's quadtree."""
-    leaves, level, camera = tree.leaves(limit), depths.level, depths.view.photograph.camera
+    leaves, level, camera = tree.leaves(limit), depths.view.finest, depths.view.photograph.camera
     height, width = depths.good.shape
     down, across = height / camera.height, width / camera.width  # level px per photograph px
     row, column = (
@@ -116,7 +98,7 @@ def _squares(depths: DepthMap, tree: Quadtree, limit: float) -> tuple[Doubles, D
 
 def share_good(views: Sequence[SweptView], maps: Sequence[DepthMap]) -> float:
     """Return the fraction of used pixels with a good depth, averaged over the views."""
-    shares = (each.good.sum() / max(each.level.used.sum(), 1) for each in maps)
+    shares = (each.good.sum() / max(each.view.finest.used.sum(), 1) for each in maps)
     return float(sum(shares)) / len(views)
 
 
