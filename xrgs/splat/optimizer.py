@@ -80,8 +80,7 @@ class SplatOptimizer:
             settings: Learning rates and Adam's constants.
             scene_scale: Extent of the scene in world units, above 0.
             steps: Number of steps of the whole run, at least 1.
-            backend: Backend that computes the steps: `torch`, `native`, `gsplat` or `auto`
-                (`resolve_backend`).
+            backend: Backend that computes the steps (`resolve_backend`).
 
         Raises:
             ValueError: `scene_scale` or `steps` is not above 0, or a setting is out of its range.
@@ -179,20 +178,13 @@ class SplatOptimizer:
         return sum(value.nbytes for state in self.adam.values() for value in state.values())
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the state for a checkpoint.
-
-        Returns:
-            `gaussians`: name -> parameter; `adam`: name -> Adam state, empty before the first step
-            of the parameter; `steps_done`.
-        """
+        """Return the state for a checkpoint: `gaussians` and `adam` by name, and `steps_done`."""
         values = {name: self.gaussians[name].detach() for name in PARAMETERS}
         adam = {name: dict(self.adam[name]) for name in PARAMETERS}
         return {"gaussians": values, "adam": adam, "steps_done": self.steps_done}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore Gaussians, moments and learning rates; drop gradients.
-
-        The number of Gaussians may differ from the present one.
+        """Restore any number of Gaussians, moments and learning rates; drop gradients.
 
         Raises:
             KeyError: A parameter or moment is missing.
@@ -219,11 +211,7 @@ class SplatOptimizer:
         self._set_rates()
 
     def keep(self, index: Tensor) -> None:
-        """Keep only the Gaussians of `index`, with their moments.
-
-        Args:
-            index: The Gaussians to keep: [N] bool, or [M] int64 indices in their new order.
-        """
+        """Keep only the Gaussians of `index`: [N] bool, or [M] int64 in their new order."""
         if index.dtype == torch.bool:
             index = index.nonzero()[:, 0]
         for name in PARAMETERS:
@@ -232,11 +220,7 @@ class SplatOptimizer:
             self._replace(name, values, lambda moment: moment.index_select(0, index))
 
     def append(self, new: Mapping[str, Tensor]) -> None:
-        """Append Gaussians, with moments of zero.
-
-        Args:
-            new: Raw parameters [M, ...] for each name of `PARAMETERS`.
-        """
+        """Append Gaussians by their raw parameters [M, ...], with moments of zero."""
         count = len(new["means"])
 
         def lengthen(moment: Tensor) -> Tensor:

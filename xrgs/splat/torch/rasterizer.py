@@ -52,20 +52,7 @@ def render(
 ) -> Render:
     """Render Gaussians into one view as `xrgs.splat.rendering.rasterize_parameters` does.
 
-    Args:
-        gaussians: N Gaussians of one floating type, whose shapes have been checked.
-        camera: The view.
-        settings: How Gaussians become pixels.
-        sh_degree: Highest band of the spherical harmonics that is on.
-        means2d_offset: [N, 2] px, added to the projected means; None for zeros.
-        raw: Whether scales and opacities are natural logarithms and logits.
-
-    Returns:
-        The render, differentiable in every parameter and the offset.
-
-    Raises:
-        ValueError: A parameter has values that are not finite or out of range.
-        MemoryError: The (tile, Gaussian) pairs do not fit in memory.
+    Shapes and types have been checked.
     """
     if raw:
         gaussians = activated(gaussians)
@@ -181,12 +168,7 @@ def _composite_batches(
 
 
 def alpha_bytes(itemsize: int, *, absgrad: bool = False) -> int:
-    """Return the bytes that `composite` saves for backward per pair of a pixel and a Gaussian.
-
-    Args:
-        itemsize: Size of a number of the floating type, bytes.
-        absgrad: Whether `RasterSettings.absgrad` is on.
-    """
+    """Return the bytes that `composite` saves for backward per pair of a pixel and a Gaussian."""
     # u, exponential, alpha, 1 - alpha, transmittance before and behind, weights, and two masks;
     # with absgrad also v and the two coordinates of the offset.
     return (10 if absgrad else 7) * itemsize + 2
