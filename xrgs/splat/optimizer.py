@@ -30,22 +30,19 @@ class SplatOptimizer:
     where t0 is `means_decay_from * steps / 30,000`, 0 in gsplat. DashGaussian [chen2025dash] starts
     the decay later, after its steps at a reduced resolution.
 
-    gsplat's rates are meant for 30,000 steps. Adam moves a log scale by at most about its rate at
-    each step, so 600 steps at 0.005 change a scale by at most a factor of e^3. The initial scales,
-    from the spacing of the SfM points, are often ten times too large. With `length_power` of p, the
-    rates of scales, quats, sh0 and shN in a run of T steps, T below 30,000, are
+    gsplat's rates are meant for 30,000 steps. With `length_power` of p, the rates of scales, quats,
+    sh0 and shN in a run of T steps, T below 30,000, are (docs/training.md has the reasons)
 
         rate(t) = rate * (30,000 / T)^(p * min(1, (T - t) / (T - t1)))
 
-    where t1 is `length_decay_from * T / 30,000`. They are constant up to t1, then fall
-    exponentially and reach gsplat's rates after the last step, so that the noise of large steps
-    settles. In runs of 30,000 steps or more they are gsplat's. Our choice: a random walk of T steps
-    gets as far as rate * sqrt(T), which p = 0.5 keeps constant. reports/rates compares powers.
+    where t1 is `length_decay_from * T / 30,000`: constant up to t1, then falling exponentially to
+    gsplat's rates after the last step. In longer runs they are gsplat's. Our choice: reports/rates
+    compares powers.
 
     With `shN_every` of k, shN and its moments are updated only at every k-th step, starting with
-    the first, by the gradient of that step and at k times the rate. Our choice: it saves computing
-    the gradients of the other steps. Adam's steps do not depend on the size of the gradient, so a
-    coefficient with a gradient of constant sign moves as far as with k = 1.
+    the first, by the gradient of that step and at k times the rate. Our choice, to save the
+    gradients of the other steps. Adam's steps do not depend on the gradient's size: a coefficient
+    with a gradient of constant sign moves as far as with k = 1.
 
     Gaussians are added and removed only through `append` and `keep`, so that parameters and state
     always fit. New Gaussians start with moments of zero and the step count of the others, as in

@@ -31,63 +31,46 @@ def strided(tensor: Tensor) -> Tensor:
     return tensor.repeat_interleave(2, dim=-1)[..., ::2]
 
 
-def adam_step(*tensors: Tensor) -> None:
-    native.adam_step([(*tensors, 0.1, 1.0)], 0.9, 0.999, 1e-15, 1)
-
-
-def adam_step_of_harmonics(*tensors: Tensor) -> None:
-    native.adam_step([], 0.9, 0.999, 1e-15, 1, (*tensors, [0.0, 0.0, 9.0], 3, 0.1, 1.0))
-
-
-def accumulate(means2d_grad: Tensor, visible: Tensor, *sums: Tensor) -> None:
-    native.accumulate_grad2d(means2d_grad, visible, 1.0, 1.0, *sums, 1)
-
-
-def config() -> Any:
-    return render_config(make_camera(20, 20), RasterSettings(), 3, CullingOptions())
-
-
-def forward(*parameters: Tensor) -> Any:
-    frame = native.Frame()
-    frame.forward(config(), *parameters, 1)
-    return frame
-
-
-def backward(v_image: Tensor, v_alpha: Tensor, *parameters: Tensor) -> None:
-    forward(*(torch.ones(N, *shape) for shape in (*SHAPES.values(), (2,)))).backward(
-        v_image, v_alpha, *parameters, True, 1
-    )
-
-
-def loss(*tensors: Tensor) -> None:
-    native.photometric_loss(*tensors, 0.8, 0.2, True, 1)
-
-
-def activation(kernel: Callable[..., Tensor]) -> Callable[..., Tensor]:
-    return lambda *tensors: kernel(*tensors, 1)
-
-
-def resample(*tensors: Tensor) -> None:
-    native.resample(*tensors, 1)
-
-
 def ones(*shapes: tuple[int, ...]) -> list[Tensor]:
     return [torch.ones(shape) for shape in shapes]
 
 
 PARAMETER_SHAPES = [(N, *shape) for shape in (*SHAPES.values(), (2,))]
+
+
+def forward(*parameters: Tensor) -> Any:
+    frame = native.Frame()
+    config = render_config(make_camera(20, 20), RasterSettings(), 3, CullingOptions())
+    frame.forward(config, *parameters, 1)
+    return frame
+
+
+def backward(*tensors: Tensor) -> None:
+    forward(*ones(*PARAMETER_SHAPES)).backward(*tensors, True, 1)
+
+
+ADAM = (0.9, 0.999, 1e-15, 1)
 CALLS: dict[str, tuple[Callable[..., object], list[Tensor]]] = {
-    "adam_step": (adam_step, ones((N,), (N,), (N,), (N,))),
+    "adam_step": (lambda *t: native.adam_step([(*t, 0.1, 1.0)], *ADAM), ones(*[(N,)] * 4)),
     "adam_step of harmonics": (
-        adam_step_of_harmonics,
+        lambda *t: native.adam_step([], *ADAM, (*t, [0.0, 0.0, 9.0], 3, 0.1, 1.0)),
         ones(*[(N, 15, 3)] * 3, (N, 3), (N, 1, 3)),
     ),
-    "accumulate_grad2d": (accumulate, [*ones((N, 2)), torch.ones(N).bool(), *ones((N,), (N,))]),
+    "accumulate_grad2d": (
+        lambda gradient, visible, *t: native.accumulate_grad2d(gradient, visible, 1.0, 1.0, *t, 1),
+        [*ones((N, 2)), torch.ones(N).bool(), *ones((N,), (N,))],
+    ),
     "forward": (forward, ones(*PARAMETER_SHAPES)),
     "backward": (backward, ones((20, 20, 3), (20, 20), *PARAMETER_SHAPES)),
-    "photometric_loss": (loss, ones(*[(20, 20, 3)] * 2, *[(10, 10, 3)] * 2, (20, 20))),
-    "resample": (resample, [*ones((20, 20, 3)), *banded_matrix(20, 9), *banded_matrix(20, 9)]),
-    "exp": (activation(native.exp), ones((N,))),
+    "photometric_loss": (
+        lambda *t: native.photometric_loss(*t, 0.8, 0.2, True, 1),
+        ones(*[(20, 20, 3)] * 2, *[(10, 10, 3)] * 2, (20, 20)),
+    ),
+    "resample": (
+        lambda *t: native.resample(*t, 1),
+        [*ones((20, 20, 3)), *banded_matrix(20, 9), *banded_matrix(20, 9)],
+    ),
+    "exp": (lambda x: native.exp(x, 1), ones((N,))),
 }
 
 

@@ -163,12 +163,7 @@ def test_a_gradient_of_exactly_the_threshold_does_not_grow() -> None:
     [
         # exp(0) is exactly 1, and so is 0.5 times the scene's scale of 2.
         ("scales", DensifySettings(grow_scale3d=0.5), 600, Refinement(duplicated=2, split=1)),
-        (
-            "scales",
-            DensifySettings(prune_scale3d=0.5, start=3000),
-            3100,
-            Refinement(pruned_scale=1),
-        ),
+        ("scales", DensifySettings(prune_scale3d=0.5), 3100, Refinement(pruned_scale=1)),
         # The logistic function of 0 is exactly 1/2.
         ("opacities", DensifySettings(prune_opacity=0.5), 600, Refinement(pruned_opacity=1)),
     ],
@@ -180,8 +175,8 @@ def test_what_is_exactly_at_a_threshold_counts_as_small_and_opaque(
     signs = torch.tensor([0.0, 1.0, -1.0]) * 1e-6
     values[name] = signs if name == "opacities" else signs[:, None].expand(3, 3)
     strategy = make_strategy(values, settings, scene_scale=2.0)
-    norm = 1.0 if "duplicated" in expected.counts() and expected.duplicated else 0.0
-    assert densify(strategy, step, view_of(3, norm=norm)) == expected
+    view = view_of(3, norm=1.0 if expected.duplicated else 0.0)
+    assert densify(strategy, step, view) == expected
 
 
 def test_opacities_at_the_cap_are_not_counted_as_reset() -> None:

@@ -194,17 +194,14 @@ class _PixelOffset(torch.autograd.Function):
 def composite(entries: Tensor, corner: Tensor, tile: int, settings: RasterSettings) -> Tensor:
     """Composite tiles front to back (3D Gaussian Splatting, section 4, equation 3).
 
-    An alpha below alpha_min is skipped, an alpha above alpha_max is capped (without gradient), and
-    a pixel ends before the Gaussian that would reduce its transmittance to transmittance_min or
-    less.
+    `RasterSettings` tells what its limits of alpha and transmittance do.
 
     Args:
-        entries: [B, K, 9] attributes of each tile's Gaussians, front to back: x, y, the Cholesky
-            factor of the conic, log opacity, colour; with absgrad [B, K, 11], since an offset of
-            value zero comes last.
+        entries: [B, K, 9] or [B, K, 11] attributes of `_project_visible` of each tile's Gaussians,
+            front to back.
         corner: [B, 2] top left corner of each tile, px.
         tile: Side of a tile, px.
-        settings: The three limits above and `absgrad` are read.
+        settings: How Gaussians become pixels.
 
     Returns:
         [B, tile^2, 4] colour without background, and alpha.
