@@ -27,16 +27,22 @@ def test_a_transmittance_of_exactly_the_least_ends_the_pixel(backend: str, pixel
         assert draw(scene, pixel, raster, sh_degree=0, backend=backend).alpha.item() == alpha
 
 
-@pytest.mark.parametrize("opacity", [0.5, 1.0 / 255.0])
-def test_an_alpha_below_the_least_is_skipped_and_one_of_exactly_the_least_is_not(
-    backend: str, pixel: Camera, opacity: float
+@pytest.mark.parametrize(
+    ("opacity", "least", "seen"),
+    [
+        (0.5, 0.5, True),  # exactly
+        (0.5, 0.5001, False),
+        (1.01 / 255, 1 / 255, True),
+        (0.99 / 255, 1 / 255, False),
+    ],
+)
+def test_an_alpha_below_the_least_is_skipped(
+    backend: str, pixel: Camera, opacity: float, least: float, seen: bool
 ) -> None:
-    scene = single_pixel(1, opacity=opacity)
-    for factor, seen in ((1.0, True), (0.99, True), (1.01, False)):
-        raster = RasterSettings(alpha_min=factor * opacity)
-        render = draw(scene, pixel, raster, sh_degree=0, backend=backend)
-        assert (render.alpha > 0).item() == seen
-        assert render.visible.tolist() == [seen]
+    scene, raster = single_pixel(1, opacity=opacity), RasterSettings(alpha_min=least)
+    render = draw(scene, pixel, raster, sh_degree=0, backend=backend)
+    assert render.alpha.item() == pytest.approx(opacity if seen else 0.0, abs=1e-7)
+    assert render.visible.tolist() == [seen]
 
 
 def test_of_equal_depths_the_lower_index_is_in_front(backend: str, pixel: Camera) -> None:

@@ -26,7 +26,7 @@ native = pytest.importorskip("xrgs._native")
 
 def activate() -> list[Tensor]:
     # torch divides its own work among threads from 32,768 elements on.
-    raw = normal_parameters(100_003, 0, size=30)
+    raw = normal_parameters(100_003, 0, size=10)
     leaves = [raw[name].requires_grad_() for name in ("scales", "opacities")]
     both = activations.activate(*leaves)
     return [*both, *torch.autograd.grad(both, leaves, [value.cos() for value in both])]
