@@ -346,15 +346,6 @@ def _place_in_world(scene: Scene) -> None:
 # --- checks -------------------------------------------------------------------------------------
 
 
-class FuzzError(Exception):
-    """A scene gives what it must not; the message says what."""
-
-
-def require(condition: bool | Tensor, message: str) -> None:
-    if not condition:
-        raise FuzzError(message)
-
-
 def render(scene: Scene) -> tuple[Render, dict[str, Tensor]]:
     """The render, and its leaves: the parameters and the offset whose gradients are needed."""
     # Leaves keep the strides of the scene's tensors.
@@ -384,21 +375,19 @@ def gradients_of(scene: Scene, rendered: Render, leaves: Mapping[str, Tensor]) -
 
 
 def check_scene(scene: Scene, *, compare: bool = False) -> str | None:
-    """Check what a scene gives; return the message of the error where it is refused, else None.
-
-    Raises:
-        FuzzError: A value is not finite or out of range, an error names nothing, a plain scene is
-            refused, or differs from torch's.
-    """
+    """Assert what a scene must give; return the message of the error where it is refused."""
     try:
         rendered, leaves = render(scene)
         check_image(rendered)
         gradients = gradients_of(scene, rendered, leaves)
     except (ValueError, MemoryError) as error:
-        require(bool(scene.cases), f"a plain scene is refused: {error}")
-        require(REFUSAL.match(str(error)) is not None, f"an error that names nothing: {error}")
+        assert scene.cases, f"a plain scene is refused: {error}"
+        assert REFUSAL.match(str(error)), f"an error that names nothing: {error}"
         return str(error)
-    check_gradients(gradients, rendered.visible)
+    for name, gradient in gradients.items():
+        assert torch.isfinite(gradient).all(), f"the gradient of {name} is silently not finite"
+        hidden = gradient[~rendered.visible]
+        assert (hidden == 0).all(), f"what is not visible has a gradient of {name}"
     if compare and LOSSY.isdisjoint(scene.cases):
         compare_with_torch(scene, rendered)
     return None
@@ -406,31 +395,18 @@ def check_scene(scene: Scene, *, compare: bool = False) -> str | None:
 
 def check_image(rendered: Render) -> None:
     image, alpha = rendered.image.detach(), rendered.alpha.detach()
-    require(torch.isfinite(image).all(), "the image is not finite")
-    require((image >= 0).all(), "the image is below 0")
-    require(((alpha >= 0) & (alpha <= 1)).all(), "alpha is not in 0..1")
-
-
-def check_gradients(gradients: Mapping[str, Tensor], visible: Tensor) -> None:
-    for name, gradient in gradients.items():
-        require(torch.isfinite(gradient).all(), f"the gradient of {name} is silently not finite")
-        require((gradient[~visible] == 0).all(), f"what is not visible has a gradient of {name}")
+    assert torch.isfinite(image).all(), "the image is not finite"
+    assert (image >= 0).all(), "the image is below 0"
+    assert ((alpha >= 0) & (alpha <= 1)).all(), "alpha is not in 0..1"
 
 
 def compare_with_torch(scene: Scene, rendered: Render) -> None:
-    """Compare a plain scene as test_rasterizer.py does; of a hostile one, the image alone.
-
-    Raises:
-        FuzzError: The image or, of a plain scene, a gradient differs by more than rounding.
-    """
+    """Compare a plain scene as test_rasterizer.py does; of a hostile one, the image alone."""
     if _near_plane_is_close(scene):
         return
     arguments = scene.tensors(), scene.camera, scene.settings
     if not scene.cases:
-        try:
-            oracle.compare(*arguments, sh_degree=scene.sh_degree)
-        except AssertionError as failure:
-            raise FuzzError(f"a plain scene differs from torch's: {failure}") from failure
+        oracle.compare(*arguments, sh_degree=scene.sh_degree)
         return
     exact, single = (
         oracle.run(*arguments, "torch", dtype, sh_degree=scene.sh_degree)[0].image.detach()
@@ -439,7 +415,7 @@ def compare_with_torch(scene: Scene, rendered: Render) -> None:
     error, allowed = ((each - exact).abs().max() for each in (rendered.image.detach(), single))
     scale = max(1.0, float(exact.max()))
     bound = oracle.FACTOR * allowed + (_threshold_step(scene.settings) + 1e-5) * scale
-    require(error <= bound, f"the image errs by {error:.2g}")
+    assert error <= bound, f"the image errs by {error:.2g}"
 
 
 def _near_plane_is_close(scene: Scene) -> bool:
@@ -463,18 +439,16 @@ def _threshold_step(settings: RasterSettings) -> float:
 def fuzz(seeds: Iterable[int], compare_every: int) -> dict[str, list[int]]:
     """Check the scenes of some seeds; return the errors with the seeds that were refused.
 
-    A scene whose seed is a multiple of `compare_every` is compared with torch.
-
-    Raises:
-        FuzzError: As `check_scene` raises it, with the seed and the cases of the scene.
+    A scene whose seed is a multiple of `compare_every` is compared with torch. An AssertionError
+    names the seed of the scene and its cases.
     """
     refused: defaultdict[str, list[int]] = defaultdict(list)
     for seed in seeds:
         scene = random_scene(seed)
         try:
             error = check_scene(scene, compare=seed % compare_every == 0)
-        except FuzzError as failure:
-            raise FuzzError(f"seed {seed} ({', '.join(scene.cases)}): {failure}") from failure
+        except AssertionError as failure:
+            raise AssertionError(f"seed {seed} ({', '.join(scene.cases)}): {failure}") from failure
         if error is not None:
             refused[error].append(seed)
         if (seed + 1) % 10_000 == 0:
@@ -492,7 +466,7 @@ def main(arguments: list[str]) -> int:
     seeds = range(options.seed, options.seed + options.count)
     try:
         refused = fuzz(seeds, options.compare_every)
-    except FuzzError as error:
+    except AssertionError as error:
         print(error)  # noqa: T201
         return 1
     total = sum(len(of_one) for of_one in refused.values())

@@ -6,16 +6,25 @@ These are errors that name what is wrong, and renders that do not disturb one an
 from __future__ import annotations
 
 import os
+import resource
 import signal
-import subprocess
-import sys
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
-from tests.splat.scenes import Scene, draw, gradients_of, make_camera, make_scene, with_gradients
+from tests.splat.scenes import (
+    Scene,
+    draw,
+    gradients_of,
+    make_camera,
+    make_scene,
+    single_pixel,
+    with_gradients,
+)
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.splat.native.rasterizer import render_config
@@ -63,23 +72,55 @@ def test_harmonics_whose_gradient_is_not_wanted_is_not_computed() -> None:
     assert all(torch.equal(gradients[0][name], gradients[1][name]) for name in gradients[0])
 
 
+def holds_in_forked_child(check: Callable[[], bool]) -> bool:
+    """Whether a check holds in a forked child, which has only our threads: torch's end there."""
+    child = os.fork()
+    if child == 0:
+        signal.alarm(60)
+        holds = False
+        try:
+            holds = check()
+        finally:
+            os._exit(not holds)
+    return os.waitpid(child, 0)[1] == 0
+
+
 def test_a_forked_child_renders() -> None:
     """20,000 Gaussians: enough for every stage to be cut into several tasks."""
     camera = make_camera(150, 110, focal=120.0, turned=True)
     scene = make_scene(20_000, camera, seed=12, size=2.0, dtype=torch.float32)
 
     def image() -> bytes:
-        # Only our threads: torch's own do not outlive a fork.
         frame = native.Frame().forward(config_of(camera), *scene.values(), None, 2)
         rendered: bytes = frame[0].numpy().tobytes()
         return rendered
 
     expected = image()
-    child = os.fork()
-    if child == 0:
-        signal.alarm(20)
-        os._exit(0 if image() == expected else 1)
-    assert os.waitpid(child, 0)[1] == 0
+    assert holds_in_forked_child(lambda: image() == expected)
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="reads Linux's /proc")
+def test_lists_beyond_memory_are_a_clear_error_and_leave_no_trace() -> None:
+    """6,000 Gaussians that cover 800 x 800 px have 15 million pairs."""
+
+    def image(count: int) -> Tensor:
+        scene = single_pixel(count, opacity=0.5) | {"scales": torch.full((count, 3), 1e6)}
+        rendered: Tensor = native.Frame().forward(config, *scene.values(), None, 1)[0]
+        return rendered
+
+    def check() -> bool:
+        used = int(Path("/proc/self/statm").read_text("utf-8").split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (used + (200 << 20), resource.RLIM_INFINITY))
+        for _ in range(2):
+            with pytest.raises(
+                MemoryError, match=r"the lists of 6000 visible Gaussians in 800x800"
+            ):
+                image(6000)
+        return torch.equal(image(100), expected)
+
+    config = config_of(make_camera(800, 800, focal=400.0), sh_degree=0)
+    expected = image(100)
+    assert holds_in_forked_child(check)
 
 
 # --- raw parameters, which the projection activates itself --------------------------------------
@@ -164,49 +205,3 @@ def test_shapes_are_checked() -> None:
             native.Frame().forward(config_of(camera), *values, None, 1)
         with pytest.raises(ValueError, match=says):
             frame.backward(v_image, v_alpha, *values, None, True, 1)
-
-
-AFTER_FAILURE = """
-import resource, torch
-from xrgs.splat.cameras import Camera
-from xrgs.splat.native.rasterizer import render_config
-from xrgs.splat.rendering import rasterize_parameters
-from xrgs.splat.settings import RasterSettings
-
-def render(n):
-    means = torch.tensor([0.0, 0.0, 1.0]).repeat(n, 1)
-    scene = [means, torch.ones(n, 4), torch.full((n, 3), 100.0), torch.full((n,), 0.5)]
-    scene += [torch.zeros(n, 1, 3), torch.zeros(n, 0, 3)]
-    K = torch.tensor([[400.0, 0, 400], [0, 400, 400], [0, 0, 1]])
-    camera = Camera(torch.eye(4), K, 800, 800)
-    made = rasterize_parameters(*scene, camera, RasterSettings(), sh_degree=0, backend="native")
-    return made.image.clone()
-
-torch.set_num_threads(1)
-before = render(100)
-used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
-resource.setrlimit(resource.RLIMIT_AS, (used + (200 << 20), resource.RLIM_INFINITY))
-for _ in range(2):
-    try:
-        render(6000)  # 15 million pairs
-    except MemoryError as error:
-        print(error)
-print(torch.equal(render(100), before))
-"""
-
-
-@pytest.mark.skipif(not os.path.exists("/proc/self/statm"), reason="reads Linux's /proc")  # noqa: PTH110
-@pytest.mark.slow
-def test_lists_beyond_memory_are_a_clear_error_and_leave_no_trace() -> None:
-    result = subprocess.run(
-        [sys.executable, "-P", "-c", AFTER_FAILURE],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
-    *errors, equal = result.stdout.splitlines() or [""]
-    assert equal == "True", (result.returncode, result.stdout, result.stderr)
-    assert len(errors) == 2
-    says = "the lists of 6000 visible Gaussians in 800x800 px do not fit"
-    assert all(says in error for error in errors)
