@@ -6,24 +6,19 @@ names are those of the page, and comments give the numbers of its equations.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
 from torch import Tensor
 from torch.linalg import cross
 
-from tests.splat.scenes import make_camera, make_scene
+from tests.splat.scenes import draw, gradients_of, make_camera, make_scene, with_gradients
 from xrgs.splat.cameras import Camera
-from xrgs.splat.rendering import rasterize_parameters
 from xrgs.splat.settings import RasterSettings
 from xrgs.splat.sh import sh_basis
 
-N, WIDTH, HEIGHT = 14, 14, 10
-FX, FY, CX, CY = 13.0, 14.3, 6.3, 6.0
-SETTINGS = RasterSettings()
-NAMES = ("means", "quats", "scales", "opacities", "sh0", "shN")
+N = 14
 
 
 def dot(a: Tensor, b: Tensor) -> Tensor:
@@ -34,13 +29,7 @@ def random(*shape: int, generator: torch.Generator) -> Tensor:
     return torch.randn(*shape, generator=generator, dtype=torch.float64)
 
 
-@pytest.fixture(scope="module")
-def camera() -> Camera:
-    return make_camera(WIDTH, HEIGHT, focal=FX, turned=True)
-
-
-@pytest.fixture(scope="module")
-def scene(camera: Camera) -> dict[str, Tensor]:
+def scene_of(camera: Camera) -> dict[str, Tensor]:
     """Gaussians in and around the image; some are so far outside that slopes are clamped."""
     made = make_scene(N, camera, seed=1, size=3.0)
     outward = made["means"] - made["means"].mean(0)
@@ -54,24 +43,26 @@ class Forward:
 
     scene: dict[str, Tensor]
     camera: Camera
-    antialiased: bool
+    raster: RasterSettings
 
     def __post_init__(self) -> None:
-        s, self.W = self.scene, self.camera.viewmat[:3, :3]
+        s, self.W, K = self.scene, self.camera.viewmat[:3, :3], self.camera.K
+        self.fx, self.fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
         local = s["means"] @ self.W.T + self.camera.viewmat[:3, 3]
         self.x, self.y, self.z = local.unbind(-1)  # 1
         self.mean2d = torch.stack(
-            [FX * self.x / self.z + CX, FY * self.y / self.z + CY], dim=-1
+            [self.fx * self.x / self.z + cx, self.fy * self.y / self.z + cy], dim=-1
         )  # 2
-        self.sx, self.sx_free = self._clamped(self.x / self.z, CX, FX, WIDTH)
-        self.sy, self.sy_free = self._clamped(self.y / self.z, CY, FY, HEIGHT)
+        self.sx, self.sx_free = self._clamped(self.x / self.z, cx, self.fx, self.camera.width)
+        self.sy, self.sy_free = self._clamped(self.y / self.z, cy, self.fy, self.camera.height)
         self.q = s["quats"] / s["quats"].norm(dim=-1, keepdim=True)
         self.Q = self._rotation()
         self.a = self.W @ (self.Q * s["scales"][:, None, :])
-        self.m0 = (FX / self.z)[:, None] * (self.a[:, 0] - self.sx[:, None] * self.a[:, 2])  # 4
-        self.m1 = (FY / self.z)[:, None] * (self.a[:, 1] - self.sy[:, None] * self.a[:, 2])
+        # 4
+        self.m0 = (self.fx / self.z)[:, None] * (self.a[:, 0] - self.sx[:, None] * self.a[:, 2])
+        self.m1 = (self.fy / self.z)[:, None] * (self.a[:, 1] - self.sy[:, None] * self.a[:, 2])
         self.n = cross(self.m0, self.m1)
-        eps = SETTINGS.eps2d
+        eps = self.raster.eps2d
         xx, yy = dot(self.m0, self.m0), dot(self.m1, self.m1)
         self.xx, self.xy, self.yy = xx + eps, dot(self.m0, self.m1), yy + eps  # 5
         self.D = dot(self.n, self.n) + eps * (xx + yy) + eps * eps  # 6
@@ -87,10 +78,10 @@ class Forward:
         self.c = self.unclamped.clamp_min(0)
         self.n_length = self.n.norm(dim=-1)
         self.compensation = self.n_length / self.D.sqrt()
-        self.o = s["opacities"] * (self.compensation if self.antialiased else 1)  # 10
+        self.o = s["opacities"] * (self.compensation if self.raster.antialiased else 1)  # 10
 
     @staticmethod
-    def _clamped(slope: Tensor, centre: float, focal: float, size: int) -> tuple[Tensor, Tensor]:
+    def _clamped(slope: Tensor, centre: Tensor, focal: Tensor, size: int) -> tuple[Tensor, Tensor]:
         margin = 0.3 * 0.5 * size / focal  # 3
         low, high = -centre / focal - margin, (size - centre) / focal + margin
         return slope.clamp(low, high), (low <= slope) & (slope <= high)
@@ -110,24 +101,25 @@ class PairGrads:
     """Equations 8 and 14 to 18 and 21: one pixel after another, summed over all pixels."""
 
     f: Forward
-    background: Tensor
 
     def __post_init__(self) -> None:
-        self.image = torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.float64)
-        self.alpha = torch.zeros(HEIGHT, WIDTH, dtype=torch.float64)
+        size = self.f.camera.height, self.f.camera.width
+        self.background = torch.tensor(self.f.raster.background, dtype=torch.float64)
+        self.image = torch.zeros(*size, 3, dtype=torch.float64)
+        self.alpha = torch.zeros(*size, dtype=torch.float64)
         self.sums = torch.zeros(N, 6, dtype=torch.float64)
         self.v_color = torch.zeros(N, 3, dtype=torch.float64)
         self.absgrad = torch.zeros(N, 2, dtype=torch.float64)
 
     def add_pixel(self, row: int, column: int, v_image: Tensor, v_alpha: Tensor) -> None:
-        f = self.f
+        f, raster = self.f, self.f.raster
         dx, dy = column + 0.5 - f.mean2d[:, 0], row + 0.5 - f.mean2d[:, 1]
         u, v = f.lxx * dx - f.lxy * dy, f.lyy * dy
         raw = f.o * torch.exp(-u * u - v * v)
-        alpha = torch.where(raw < SETTINGS.alpha_min, 0.0, raw.clamp_max(SETTINGS.alpha_max))  # 8
+        alpha = torch.where(raw < raster.alpha_min, 0.0, raw.clamp_max(raster.alpha_max))  # 8
         T, composited = torch.ones((), dtype=torch.float64), []
         for i in torch.argsort(f.z).tolist():
-            if T * (1 - alpha[i]) <= SETTINGS.transmittance_min:
+            if T * (1 - alpha[i]) <= raster.transmittance_min:
                 break
             composited.append((i, alpha[i] * T))
             self.image[row, column] += alpha[i] * T * f.c[i]
@@ -137,7 +129,7 @@ class PairGrads:
         R = torch.zeros((), dtype=torch.float64)
         for i, weight in reversed(composited):
             G = f.c[i] @ v_image - self.background @ v_image + v_alpha  # 16
-            g = weight * (G - R) * (raw[i] <= SETTINGS.alpha_max)  # 17
+            g = weight * (G - R) * (raw[i] <= raster.alpha_max)  # 17
             R = R + alpha[i] * (G - R)
             of_u, y = u[i], dy[i]
             powers = [torch.ones_like(y), of_u, y, of_u * of_u, of_u * y, y * y]
@@ -157,12 +149,12 @@ def gradients(f: Forward, pairs: PairGrads) -> dict[str, Tensor]:
     v_yy = (shared / 2 - f.lyy * v_lyy / 2 - f.lxy * v_lxy) / f.yy
     v_D = -shared / (2 * f.D)
     v_n_length, v_opacity = torch.zeros_like(v_D), v_o
-    if f.antialiased:  # 24
+    if f.raster.antialiased:  # 24
         v_D = v_D - v_o * f.o / (2 * f.D)
         v_n_length = v_o * f.scene["opacities"] / f.D.sqrt()
         v_opacity = v_o * f.compensation
     v_n = (2 * v_D + v_n_length / f.n_length)[:, None] * f.n
-    eps = SETTINGS.eps2d
+    eps = f.raster.eps2d
     v_m0 = cross(f.m1, v_n) + 2 * (eps * v_D)[:, None] * f.m0 + v_xy[:, None] * f.m1  # 25
     v_m1 = cross(v_n, f.m0) + 2 * (v_yy + eps * v_D)[:, None] * f.m1 + v_xy[:, None] * f.m0
     v_mean, v_scale, v_quat = geometry_gradients(f, v_mean2d, v_m0, v_m1)
@@ -187,12 +179,12 @@ def geometry_gradients(
     f: Forward, v_mean2d: Tensor, v_m0: Tensor, v_m1: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Equations 26 to 30: means (without their colour's part), scales, quaternions."""
-    v_a0, v_a1 = (FX / f.z)[:, None] * v_m0, (FY / f.z)[:, None] * v_m1  # 26
+    v_a0, v_a1 = (f.fx / f.z)[:, None] * v_m0, (f.fy / f.z)[:, None] * v_m1  # 26
     v_a = torch.stack([v_a0, v_a1, -f.sx[:, None] * v_a0 - f.sy[:, None] * v_a1], dim=1)
     v_sx = torch.where(f.sx_free, -dot(v_a0, f.a[:, 2]), 0.0)
     v_sy = torch.where(f.sy_free, -dot(v_a1, f.a[:, 2]), 0.0)
-    v_x = (FX * v_mean2d[:, 0] + v_sx) / f.z  # 27
-    v_y = (FY * v_mean2d[:, 1] + v_sy) / f.z
+    v_x = (f.fx * v_mean2d[:, 0] + v_sx) / f.z  # 27
+    v_y = (f.fy * v_mean2d[:, 1] + v_sy) / f.z
     v_z = -(f.x * v_x + f.y * v_y + dot(v_m0, f.m0) + dot(v_m1, f.m1)) / f.z
     v_mean = torch.stack([v_x, v_y, v_z], dim=-1) @ f.W  # 28
     v_B = f.W.T @ v_a
@@ -211,34 +203,36 @@ def geometry_gradients(
     return v_mean, v_scale, (v_unit - dot(v_unit, f.q)[:, None] * f.q) / length
 
 
-@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize(
+    ("width", "height", "raster"),
+    [
+        (14, 10, RasterSettings(background=(0.2, 0.5, 0.9))),
+        (14, 10, RasterSettings(antialiased=True, eps2d=0.1)),
+        (17, 8, RasterSettings(alpha_min=0.1, alpha_max=0.5, transmittance_min=0.2)),
+        (9, 16, RasterSettings(alpha_min=0.0, alpha_max=1.0, transmittance_min=0.0)),
+        (1, 9, RasterSettings()),
+    ],
+)
 def test_the_equations_are_those_of_the_torch_rasterizer(
-    scene: dict[str, Tensor], camera: Camera, antialiased: bool
+    width: int, height: int, raster: RasterSettings
 ) -> None:
-    g = torch.Generator().manual_seed(2)
-    v_image, v_alpha = random(HEIGHT, WIDTH, 3, generator=g), random(HEIGHT, WIDTH, generator=g)
-    background = (0.2, 0.5, 0.9)
+    camera = make_camera(width, height, focal=13.0, turned=True)
+    scene, g = scene_of(camera), torch.Generator().manual_seed(2)
+    v_image, v_alpha = random(height, width, 3, generator=g), random(height, width, generator=g)
     expected: dict[str, Tensor] = {}
     for absgrad in (True, False):
-        leaves: dict[str, Any] = {name: scene[name].clone().requires_grad_() for name in NAMES}
-        offset = torch.zeros(N, 2, dtype=torch.float64, requires_grad=True)
-        raster = RasterSettings(antialiased=antialiased, background=background, absgrad=absgrad)
-        render = rasterize_parameters(
-            **leaves,
-            camera=camera,
-            settings=raster,
-            sh_degree=3,
-            means2d_offset=offset,
-            backend="torch",
-        )
-        ((render.image * v_image).sum() + (render.alpha * v_alpha).sum()).backward()  # type: ignore[no-untyped-call]
-        leaves["absgrad" if absgrad else "means2d_offset"] = offset
-        expected |= {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
+        leaves = with_gradients(scene | {"means2d_offset": torch.zeros(N, 2).double()})
+        offset = leaves["means2d_offset"]
+        render = draw(leaves, camera, replace(raster, absgrad=absgrad), means2d_offset=offset)
+        torch.autograd.backward((render.image * v_image).sum() + (render.alpha * v_alpha).sum())
+        expected |= gradients_of(leaves)
+        if absgrad:
+            expected["absgrad"] = expected.pop("means2d_offset")
 
-    f = Forward(scene, camera, antialiased)
-    pairs = PairGrads(f, torch.tensor(background, dtype=torch.float64))
-    for row in range(HEIGHT):
-        for column in range(WIDTH):
+    f = Forward(scene, camera, raster)
+    pairs = PairGrads(f)
+    for row in range(height):
+        for column in range(width):
             pairs.add_pixel(row, column, v_image[row, column], v_alpha[row, column])
     ours = gradients(f, pairs) | {"absgrad": pairs.absgrad}
 
@@ -251,10 +245,11 @@ def test_the_equations_are_those_of_the_torch_rasterizer(
         assert (value - expected[name]).norm() <= 1e-12 * expected[name].norm(), name
 
 
-def test_the_cutoff_ellipse(scene: dict[str, Tensor], camera: Camera) -> None:
+def test_the_cutoff_ellipse() -> None:
     """Equations 11 to 13, against a walk around each ellipse."""
-    f = Forward(scene, camera, antialiased=False)
-    rho = torch.log(f.o / SETTINGS.alpha_min).sqrt()[:, None]  # 11
+    camera = make_camera(14, 10, focal=13.0, turned=True)
+    f = Forward(scene_of(camera), camera, RasterSettings())
+    rho = torch.log(f.o / f.raster.alpha_min).sqrt()[:, None]  # 11
     angle = torch.linspace(0, 2 * torch.pi, 20_001, dtype=torch.float64)
     dy = rho * angle.sin() / f.lyy[:, None]
     dx = (rho * angle.cos() + f.lxy[:, None] * dy) / f.lxx[:, None]

@@ -132,17 +132,32 @@ def gradients_of(leaves: Scene) -> Scene:
 
 
 def make_optimizer(
-    values: Scene, *, scene_scale: float = 1.0, backend: str = "torch"
+    values: Scene,
+    settings: OptimizerSettings | None = None,
+    *,
+    scene_scale: float = 1.0,
+    steps: int = 1,
+    backend: str = "torch",
 ) -> SplatOptimizer:
-    """An optimizer of Gaussians with these raw parameters, whose rates stay as they are."""
+    """An optimizer of Gaussians with these raw parameters, by default with rates that stay."""
     leaves = {name: values[name].clone().requires_grad_() for name in PARAMETERS}
     return SplatOptimizer(
         Gaussians(**leaves),
-        OptimizerSettings(means_final=1.0),
+        settings or OptimizerSettings(means_final=1.0),
         scene_scale=scene_scale,
-        steps=1,
+        steps=steps,
         backend=backend,
     )
+
+
+def take_step(
+    optimizer: SplatOptimizer, gradients: Scene, camera: Camera | None = None, sh_degree: int = 0
+) -> None:
+    """A step by gradients of some parameters."""
+    optimizer.zero_grad()
+    for name, gradient in gradients.items():
+        optimizer.gaussians[name].grad = gradient.clone()
+    optimizer.step(camera, sh_degree=sh_degree)
 
 
 def make_strategy(

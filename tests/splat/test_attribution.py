@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.splat.scenes import Scene, draw, make_camera, make_scene
+from tests.splat.scenes import Scene, draw, make_camera, make_scene, with_gradients
 from xrgs.splat.attribution import attribute_pixels
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import ActivatedGaussians
@@ -71,10 +71,14 @@ def test_a_map_of_ones_comes_to_the_alpha_of_the_image() -> None:
     scene = make_scene(40, camera)
     render = draw(scene, camera)
     ones = torch.ones(camera.height, camera.width, dtype=torch.float64)
-    found = attribute_pixels(ones, ActivatedGaussians(**scene), camera, RasterSettings())
+    leaves = with_gradients(scene)
+    found = attribute_pixels(ones, ActivatedGaussians(**leaves), camera, RasterSettings())
     torch.testing.assert_close(found.sums.sum(), render.alpha.sum())
     assert found.evaluations == render.evaluations
     assert (found.sums[~render.visible] == 0).all()
+    # Nothing of the Gaussians is changed.
+    assert not found.sums.requires_grad
+    assert all(leaf.grad is None for leaf in leaves.values())
 
 
 def test_native_attributes_as_torch_does() -> None:
@@ -89,21 +93,7 @@ def test_native_attributes_as_torch_does() -> None:
     assert expected.std() > 0.1
 
 
-def test_nothing_of_the_gaussians_is_changed(in_a_row: Scene) -> None:
-    camera = make_camera()
-    leaves = {name: value.requires_grad_() for name, value in in_a_row.items()}
-    found = attribute_pixels(
-        random_map(camera), ActivatedGaussians(**leaves), camera, RasterSettings()
-    )
-    assert not found.sums.requires_grad
-    assert all(leaf.grad is None for leaf in leaves.values())
-
-
 def test_a_map_of_another_size_is_refused(in_a_row: Scene) -> None:
+    pixels, gaussians = torch.ones(20, 14).double(), ActivatedGaussians(**in_a_row)
     with pytest.raises(ValueError, match=r"pixels must be \[14, 20\]"):
-        attribute_pixels(
-            torch.ones(20, 14).double(),
-            ActivatedGaussians(**in_a_row),
-            make_camera(),
-            RasterSettings(),
-        )
+        attribute_pixels(pixels, gaussians, make_camera(), RasterSettings())

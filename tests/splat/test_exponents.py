@@ -6,13 +6,12 @@ import math
 
 import pytest
 import torch
-from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import HealthCheck, Phase, example, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
 from tests.splat.scenes import Scene, draw, gradients_of, make_camera, make_scene, with_gradients
 from xrgs.splat.cameras import Camera
-from xrgs.splat.quaternions import rotation_matrices
 from xrgs.splat.settings import RasterSettings
 
 #: The exponents of the smallest denormal and of the largest number of float32.
@@ -55,10 +54,12 @@ def exact(values: Tensor, exponent: int) -> Tensor:
 
 @FEW
 @given(exponents=st.lists(st.integers(LEAST, MOST - 2), min_size=5, max_size=5))
+@example(exponents=[LEAST, LEAST + 1, LEAST + 2, LEAST + 3, -126])
 def test_the_length_of_a_quaternion_changes_no_image(backend: str, exponents: list[int]) -> None:
     scene = make_scene(20, CAMERA, seed=1, dtype=torch.float32)
     for row, exponent in enumerate(exponents):
         scene["quats"][row] = exact(scene["quats"][row], exponent)
+    scene["quats"][5] = 0  # no rotation
     double = {name: value.double() for name, value in scene.items()}
     image = draw(scene, CAMERA, backend=backend).image
     assert (image - draw(double, CAMERA).image).abs().max() < 3e-5
@@ -79,18 +80,6 @@ def test_gradients_of_quaternions_of_any_length(backend: str, exponents: list[in
         assert error < 2e-3 * true["quats"].abs().max(), exponent
 
 
-def test_a_quaternion_of_denormal_numbers_alone_is_normalised(backend: str) -> None:
-    """Its components are 3, -5, 2 and 7 times the smallest number above 0."""
-    quat = torch.tensor([3.0, -5, 2, 7])
-    scene = make_scene(20, CAMERA, seed=1, dtype=torch.float32)
-    scene["quats"][:] = exact(quat, LEAST)
-    image = draw(scene, CAMERA, backend=backend).image
-    scene["quats"][:] = quat
-    assert (image - draw(scene, CAMERA, backend=backend).image).abs().max() < 1e-6
-    rotations = rotation_matrices(exact(quat, LEAST)[None])
-    torch.testing.assert_close(rotations, rotation_matrices(quat[None]))
-
-
 @FEW
 @given(
     exponents=st.lists(st.integers(-60, 56), min_size=5, max_size=5),
@@ -106,32 +95,24 @@ def test_gaussians_of_any_size_are_drawn(
     check(scene, backend, RasterSettings(antialiased=antialiased))
 
 
-@pytest.mark.parametrize("size", [1e10, 1e14, 1e16])
-def test_a_gaussian_of_many_pixels_fills_the_image(backend: str, size: float) -> None:
-    scene = make_scene(1, CAMERA, seed=2, dtype=torch.float32)
-    scene["scales"][:] = size
-    render = draw(scene, CAMERA, backend=backend)
-    assert render.visible.all()
-    assert (render.alpha - scene["opacities"]).abs().max() < 1e-6
-
-
-@pytest.mark.parametrize("size", [1e18, 1e25, 3e38])
-@pytest.mark.parametrize("raster", [RasterSettings(), RasterSettings(antialiased=True)])
+@pytest.mark.parametrize(("size", "antialiased"), [(1e18, False), (1e25, True), (3e38, False)])
 def test_a_gaussian_larger_than_float32_holds_is_refused(
-    backend: str, size: float, raster: RasterSettings
+    backend: str, size: float, antialiased: bool
 ) -> None:
+    raster = RasterSettings(antialiased=antialiased)
     scene = make_scene(8, CAMERA, seed=2, dtype=torch.float32)
     scene["scales"][3, 1] = size
     with pytest.raises(
         ValueError, match=r"^scales: a Gaussian is larger than 1e\+?18 px in the im"
     ):
         draw(scene, CAMERA, raster, backend=backend)
-    for hidden in ({"means": torch.tensor([0.0, 0, -5])}, {"opacities": torch.tensor(0.0)}):
-        draw({k: v.index_copy(0, torch.tensor([3]), hidden[k][None]) if k in hidden else v
-              for k, v in scene.items()}, CAMERA, raster, backend=backend)  # fmt: skip
+    for name, hidden in (("means", torch.tensor([0.0, 0, -5])), ("opacities", torch.tensor(0.0))):
+        other = scene[name].clone()
+        other[3] = hidden
+        draw(scene | {name: other}, CAMERA, raster, backend=backend)
 
 
-@pytest.mark.parametrize("width", [0.1, 0.03, 0.01])
+@pytest.mark.parametrize("width", [0.1, 0.01])
 def test_needles_without_dilation_are_as_exact_as_their_place(backend: str, width: float) -> None:
     """A place is rounded to float32: some 2^-24 of the image's size, by the width of the needle."""
     scene = make_scene(30, CAMERA, seed=7, dtype=torch.float32, size=width)

@@ -5,15 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.splat.scenes import noise, similar_pair
 from xrgs.splat.loss import photometric_loss, prepare_target
 
 
-@pytest.mark.parametrize("weighted", [False, True])
-@pytest.mark.parametrize(("l1", "ssim"), [(0.8, 0.2), (1.0, 0.0), (0.0, 1.0), (0.3, 2.0)])
+@pytest.mark.parametrize(
+    ("l1", "ssim", "weighted"), [(0.8, 0.2, False), (0.0, 1.0, False), (0.3, 2.0, True)]
+)
 def test_the_loss_is_its_formula(l1: float, ssim: float, weighted: bool) -> None:
     from skimage.metrics import structural_similarity as skimage_ssim
 
@@ -34,7 +35,7 @@ def test_the_loss_is_its_formula(l1: float, ssim: float, weighted: bool) -> None
     lacking = (w[5:-5, 5:-5, None] * (1 - similarity[5:-5, 5:-5])).mean()
     target = prepare_target(photograph)
     loss = photometric_loss(image, target, l1=l1, ssim=ssim, pixel_weight=weights).item()
-    assert loss == pytest.approx(l1 * absolute + ssim * lacking, rel=1e-9)
+    assert loss == pytest.approx(l1 * absolute + ssim * lacking, rel=1e-10)
 
 
 @pytest.mark.parametrize("weighted", [False, True])
@@ -47,25 +48,6 @@ def test_gradients_are_those_of_finite_differences(weighted: bool) -> None:
         image.requires_grad_(),
         rtol=1e-6,
         atol=1e-9,
-    )
-
-
-def test_float32_is_float64_rounded() -> None:
-    image, photograph = similar_pair(52, 67)
-    results = []
-    for dtype in (torch.float32, torch.float64):
-        x = image.to(dtype).requires_grad_()
-        loss = photometric_loss(x, prepare_target(photograph.to(dtype)), l1=0.8, ssim=0.2)
-        torch.autograd.backward(loss)
-        assert loss.dtype == dtype
-        assert x.grad is not None
-        results.append((loss.item(), x.grad.double()))
-    (loss32, grad32), (loss64, grad64) = results
-    assert loss32 == pytest.approx(loss64, rel=1e-6)
-    # Where |image - target| is within rounding of 0 its sign, and L1's gradient, may differ.
-    certain = (image - photograph).abs() > 1e-6
-    torch.testing.assert_close(
-        grad32[certain], grad64[certain], rtol=1e-4, atol=1e-4 * grad64.abs().max().item()
     )
 
 
@@ -91,22 +73,21 @@ def test_ssim_keeps_its_digits_near_convergence(
     assert (grad32 - grad64).norm() <= 1e-6 * grad64.norm()
 
 
-@settings(max_examples=50)
+@settings(max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     levels=st.tuples(*[st.floats(-1e4, 1e4, width=32)] * 2),
     noisy=st.booleans(),
 )
-def test_flat_images_stay_finite(levels: tuple[float, float], noisy: bool) -> None:
+def test_flat_images_stay_finite(backend: str, levels: tuple[float, float], noisy: bool) -> None:
     # E[x^2] - E[x]^2 of a flat image is often below 0 in float32.
     image = torch.full((12, 15, 3), levels[0]).requires_grad_()
     photograph = torch.full((12, 15, 3), levels[1]) + noisy * noise(12, 15).float()
-    target = prepare_target(photograph)
+    target = prepare_target(photograph, backend=backend)
     assert (target.variance >= 0).all()
-    loss = photometric_loss(image, target, l1=0.8, ssim=0.2)
-    torch.autograd.backward(loss)
-    assert image.grad is not None
+    loss = photometric_loss(image, target, l1=0.8, ssim=0.2, backend=backend)
+    (gradient,) = torch.autograd.grad(loss, image)
     assert loss.isfinite()
-    assert image.grad.isfinite().all()
+    assert gradient.isfinite().all()
 
 
 def test_a_target_keeps_no_graph() -> None:
@@ -114,16 +95,13 @@ def test_a_target_keeps_no_graph() -> None:
     assert not any(x.requires_grad for x in (target.image, target.mean, target.variance))
 
 
-@pytest.mark.parametrize("size", [(10, 30), (30, 10), (1, 1)])
-def test_an_image_smaller_than_the_window_is_refused(size: tuple[int, int]) -> None:
-    with pytest.raises(ValueError, match=f"{size[1]} x {size[0]} px.*11 px"):
-        prepare_target(torch.zeros(*size, 3))
-
-
 def test_wrong_shapes_are_refused() -> None:
     target = prepare_target(torch.zeros(20, 24, 3))
     with pytest.raises(ValueError, match=r"image must be \[H, W, 3\], got \[20, 20\]"):
         prepare_target(torch.zeros(20, 20))
+    for height, width in ((10, 30), (30, 10)):
+        with pytest.raises(ValueError, match=f"{width} x {height} px.*11 px"):
+            prepare_target(torch.zeros(height, width, 3))
     with pytest.raises(ValueError, match=r"image is \[20, 21, 3\], its target \[20, 24, 3\]"):
         photometric_loss(torch.zeros(20, 21, 3), target, l1=1, ssim=0)
     image, weight = torch.zeros(20, 24, 3), torch.ones(24, 20)

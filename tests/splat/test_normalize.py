@@ -28,6 +28,15 @@ def turn(rng: np.random.Generator) -> Array:
     return rotation
 
 
+def assert_rigid(transforms: Array) -> None:
+    """Assert that these matrices [..., 3 or 4, 3 or 4] turn, and neither scale nor mirror."""
+    rotation = transforms[..., :3, :3]
+    np.testing.assert_allclose(
+        rotation @ rotation.swapaxes(-1, -2), np.broadcast_to(np.eye(3), rotation.shape), atol=1e-12
+    )
+    np.testing.assert_allclose(np.linalg.det(rotation), 1)
+
+
 def similarity(rng: np.random.Generator, scale: float) -> Array:
     matrix = np.eye(4)
     matrix[:3, :3] = scale * turn(rng)
@@ -59,20 +68,21 @@ def in_cameras(viewmats: Array, points: Array) -> Array:
 
 
 def test_what_cameras_see_only_changes_its_scale(world: World) -> None:
-    normalized = normalize_scene(*world)
+    viewmats, points = world
+    normalized = normalize_scene(viewmats, points)
     scale = np.cbrt(np.linalg.det(normalized.transform[:3, :3]))
     np.testing.assert_allclose(
         in_cameras(normalized.viewmats, normalized.points),
-        scale * in_cameras(*world),
+        scale * in_cameras(viewmats, points),
         atol=1e-10,
     )
-    rotations = normalized.viewmats[:, :3, :3]
+    assert_rigid(normalized.viewmats)
     np.testing.assert_allclose(
-        rotations @ rotations.transpose(0, 2, 1), np.tile(np.eye(3), (7, 1, 1)), atol=1e-12
+        transform_points(normalized.transform, points), normalized.points, atol=1e-12
     )
-    np.testing.assert_allclose(
-        transform_points(normalized.transform, world[1]), normalized.points, atol=1e-12
-    )
+    positions = [-v[:3, :3].T @ v[:3, 3] for v in normalized.viewmats]
+    extent = max(np.linalg.norm(p - np.mean(positions, axis=0)) for p in positions)
+    assert normalized.scene_scale == pytest.approx(1.1 * extent)
 
 
 def test_similarity_turns_up_and_puts_the_median_camera_at_one(world: World) -> None:
@@ -81,19 +91,6 @@ def test_similarity_turns_up_and_puts_the_median_camera_at_one(world: World) -> 
     up = -moved[:, 1, :3].mean(0)
     np.testing.assert_allclose(up / np.linalg.norm(up), [0, -1, 0], atol=1e-12)
     assert np.median(np.linalg.norm(camera_positions(moved), axis=1)) == pytest.approx(1)
-
-
-def test_focus_is_where_the_optical_axes_meet() -> None:
-    """Cameras on a circle that look at the world's origin: it stays, and they are at 1."""
-    viewmats = []
-    for angle in np.linspace(0, 2, 5):
-        c, s = np.cos(angle), np.sin(angle)
-        viewmat = np.eye(4)
-        viewmat[:3, :3] = [[c, 0, s], [0, 1, 0], [-s, 0, c]]
-        viewmat[2, 3] = 4.0
-        viewmats.append(viewmat)
-    expected = np.diag([0.25, 0.25, 0.25, 1])
-    np.testing.assert_allclose(similarity_from_cameras(np.stack(viewmats)), expected, atol=1e-12)
 
 
 def test_focus_and_scale_are_medians() -> None:
@@ -115,26 +112,17 @@ def test_points_end_on_their_principal_axes(world: World) -> None:
     assert (np.diff(np.diag(covariance)) < 0).all(), "x the widest, z the thinnest"
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_principal_axes_are_a_rigid_motion_of_the_median_to_zero(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    points = (rng.normal(size=(50, 3)) * (3, 2, 1)) @ turn(rng).T + rng.normal(size=3)
-    transform = principal_axes(points)
-    rotation = transform[:3, :3]
-    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(rotation) == pytest.approx(1)
-    median = np.median(points, axis=0)
-    np.testing.assert_allclose(transform_points(transform, median[None]), [[0, 0, 0]], atol=1e-12)
+def test_principal_axes_are_a_rigid_motion_of_the_median_to_zero() -> None:
+    for seed in range(6):  # eigenvectors of either orientation
+        rng = np.random.default_rng(seed)
+        points = (rng.normal(size=(50, 3)) * (3, 2, 1)) @ turn(rng).T + rng.normal(size=3)
+        transform = principal_axes(points)
+        assert_rigid(transform)
+        median = transform_points(transform, np.median(points, axis=0)[None])
+        np.testing.assert_allclose(median, [[0, 0, 0]], atol=1e-12)
 
 
-def test_scene_scale_is_the_cameras_extent(world: World) -> None:
-    normalized = normalize_scene(*world)
-    positions = [-v[:3, :3].T @ v[:3, 3] for v in normalized.viewmats]
-    extent = max(np.linalg.norm(p - np.mean(positions, axis=0)) for p in positions)
-    assert normalized.scene_scale == pytest.approx(1.1 * extent)
-
-
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_any_world_is_normalised_to_a_similar_one(world: World, seed: int) -> None:
     """Whatever similarity the world came by, only the size of what is seen may differ."""
     viewmats, points = world
@@ -149,20 +137,18 @@ def test_any_world_is_normalised_to_a_similar_one(world: World, seed: int) -> No
     )
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_rotation_between(seed: int) -> None:
-    rng = np.random.default_rng(seed)
+def test_rotation_between() -> None:
+    rng = np.random.default_rng(0)
     start, end = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
     for target in (end, start, -start):
         rotation = rotation_between(start, target)
         np.testing.assert_allclose(rotation @ start, target, atol=1e-12)
-        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
-        assert np.linalg.det(rotation) == pytest.approx(1)
+        assert_rigid(rotation)
 
 
 def test_one_camera_on_its_own_focus_keeps_the_scale(world: World) -> None:
-    _, points = world
-    normalized = normalize_scene(np.eye(4)[None], points)
+    """One camera and three points are enough."""
+    normalized = normalize_scene(np.eye(4)[None], world[1][:3])
     assert np.isfinite(normalized.points).all()
     assert np.linalg.det(normalized.transform[:3, :3]) == pytest.approx(1)
 
@@ -180,8 +166,3 @@ def test_one_camera_on_its_own_focus_keeps_the_scale(world: World) -> None:
 def test_bad_input_is_named(world: World, change: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         normalize_scene(**({"viewmats": world[0], "points": world[1]} | change))
-
-
-def test_one_camera_and_three_points_are_enough(world: World) -> None:
-    viewmats, points = world
-    assert len(normalize_scene(viewmats[:1], points[:3]).points) == 3

@@ -11,7 +11,14 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from tests.splat.scenes import make_camera, normal_parameters
+from tests.splat.scenes import (
+    draw,
+    make_camera,
+    make_optimizer,
+    make_scene,
+    normal_parameters,
+    take_step,
+)
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.splat.optimizer import SplatOptimizer
 from xrgs.splat.settings import OptimizerSettings
@@ -28,10 +35,6 @@ GSPLAT_RATES = {
 }
 
 
-def gaussians_of(values: dict[str, Tensor]) -> Gaussians:
-    return Gaussians(**{name: value.clone().requires_grad_() for name, value in values.items()})
-
-
 def optimizer_of(
     count: int = 5,
     *,
@@ -40,25 +43,17 @@ def optimizer_of(
     backend: str = "torch",
     settings: OptimizerSettings | None = None,
 ) -> SplatOptimizer:
-    gaussians = gaussians_of(normal_parameters(count, 0, dtype=dtype))
+    values = normal_parameters(count, 0, dtype=dtype)
     settings = settings or OptimizerSettings()
-    return SplatOptimizer(gaussians, settings, scene_scale=2.0, steps=steps, backend=backend)
+    return make_optimizer(values, settings, scene_scale=2.0, steps=steps, backend=backend)
 
 
-def take_step(optimizer: SplatOptimizer, seed: int) -> dict[str, Tensor]:
-    gradients = normal_parameters(
-        len(optimizer.gaussians), seed, dtype=optimizer.gaussians.means.dtype
-    )
-    optimizer.zero_grad()
-    for name in PARAMETERS:
-        optimizer.gaussians[name].grad = gradients[name].clone()
-    optimizer.step()
+def step_of(optimizer: SplatOptimizer, seed: int) -> dict[str, Tensor]:
+    """Take a step by random gradients, and return these."""
+    of = optimizer.gaussians
+    gradients = normal_parameters(len(of), seed, dtype=of.means.dtype)
+    take_step(optimizer, gradients)
     return gradients
-
-
-def moments(optimizer: SplatOptimizer, name: str) -> tuple[Tensor, Tensor]:
-    state = optimizer.adam[name]
-    return state["exp_avg"], state["exp_avg_sq"]
 
 
 @pytest.mark.parametrize(
@@ -68,7 +63,7 @@ def moments(optimizer: SplatOptimizer, name: str) -> tuple[Tensor, Tensor]:
 def test_it_is_one_adam_a_parameter(dtype: torch.dtype, fused: bool, tolerance: float) -> None:
     steps = 40
     optimizer = optimizer_of(steps=steps, dtype=dtype)
-    expected = gaussians_of(normal_parameters(5, 0, dtype=dtype))
+    expected = make_optimizer(normal_parameters(5, 0, dtype=dtype)).gaussians
     theirs = {
         name: torch.optim.Adam(
             [expected[name]],
@@ -82,7 +77,7 @@ def test_it_is_one_adam_a_parameter(dtype: torch.dtype, fused: bool, tolerance: 
     }
     decay = torch.optim.lr_scheduler.ExponentialLR(theirs["means"], gamma=0.01 ** (1.0 / steps))
     for seed in range(steps):
-        gradients = take_step(optimizer, seed)
+        gradients = step_of(optimizer, seed)
         for name, adam in theirs.items():
             expected[name].grad = gradients[name]
             adam.step()
@@ -94,65 +89,59 @@ def test_it_is_one_adam_a_parameter(dtype: torch.dtype, fused: bool, tolerance: 
         torch.testing.assert_close(ours, reference, rtol=tolerance, atol=tolerance)
 
 
-def test_the_rate_of_means_decays_to_a_hundredth() -> None:
-    optimizer = optimizer_of(steps=8)
-    rates = []
-    for seed in range(8):
-        rates.append(optimizer.rates["means"])
-        take_step(optimizer, seed)
-    rates.append(optimizer.rates["means"])
-    assert rates == pytest.approx([1.6e-4 * 2.0 * 0.01 ** (step / 8) for step in range(9)])
-    assert rates[-1] == pytest.approx(1.6e-4 * 2.0 * 0.01)
-    optimizer.rates["means"] = GSPLAT_RATES["means"]
-    assert optimizer.rates == pytest.approx(GSPLAT_RATES)
-
-
-def test_the_decay_of_the_rate_of_means_may_wait() -> None:
-    optimizer = optimizer_of(steps=20, settings=OptimizerSettings(means_decay_from=7500))
+@pytest.mark.parametrize("waits", [0, 5])
+def test_the_rate_of_means_decays_to_a_hundredth(waits: int) -> None:
+    """After `waits` of 20 steps."""
+    optimizer = optimizer_of(steps=20, settings=OptimizerSettings(means_decay_from=1500 * waits))
     rates = []
     for seed in range(21):
         rates.append(optimizer.rates["means"])
-        take_step(optimizer, seed)
-    waiting = [3.2e-4] * 6  # after 0 to 5 steps, a quarter of the run
-    assert rates == pytest.approx(waiting + [3.2e-4 * 0.01 ** (s / 15) for s in range(1, 16)])
+        step_of(optimizer, seed)
+    decaying = [3.2e-4 * 0.01 ** (step / (20 - waits)) for step in range(1, 21 - waits)]
+    assert rates == pytest.approx([3.2e-4] * (waits + 1) + decaying)
+    assert optimizer.rates | {"means": 1.6e-4} == pytest.approx(GSPLAT_RATES)
 
 
-def rates_over_a_run(steps: int, settings: OptimizerSettings) -> Tensor:
-    """The rates of scales, quats, sh0, shN, means and opacities before each step, [steps, 6]."""
+def rates_over_a_run(steps: int, settings: OptimizerSettings) -> tuple[Tensor, Tensor]:
+    """Some steps, 1000 at most, and the rates before each of these, [S, 6].
+
+    The columns are scales, quats, sh0, shN, means and opacities.
+    """
     names = ("scales", "quats", "sh0", "shN", "means", "opacities")
     optimizer = optimizer_of(steps=steps, settings=settings)
-    rows = []
-    for _ in range(steps):
+    done, rows = torch.arange(0, steps, max(1, steps // 1000)), []
+    for step in done.tolist():
+        if step:
+            optimizer.steps_done = step - 1
+            optimizer.skip_step()
         rows.append([optimizer.rates[name] for name in names])
-        optimizer.skip_step()
-    return torch.tensor(rows, dtype=torch.float64)
+    return done, torch.tensor(rows, dtype=torch.float64)
 
 
-@pytest.mark.parametrize("power", [0.5, 1.0])
-@pytest.mark.parametrize("steps", [1, 7, 600, 30_000])
+@pytest.mark.parametrize(("steps", "power"), [(1, 0.5), (7, 1.0), (600, 0.5)])
 def test_the_rates_fit_the_length_of_a_run(steps: int, power: float) -> None:
     """Against the formula: constant for six tenths of the run, then exponentially to gsplat's."""
-    found = rates_over_a_run(steps, OptimizerSettings(length_power=power))
-    plain = rates_over_a_run(steps, OptimizerSettings())
-    done = torch.arange(steps, dtype=torch.float64) / steps
-    first, last = math.log(30_000 / steps) * power, 0.0
-    logarithm = torch.where(done < 0.6, first, first + (last - first) * (done - 0.6) / 0.4)
+    done, found = rates_over_a_run(steps, OptimizerSettings(length_power=power))
+    _, plain = rates_over_a_run(steps, OptimizerSettings())
+    share = done.double() / steps
+    first = math.log(30_000 / steps) * power
+    logarithm = torch.where(share < 0.6, first, first * (1 - (share - 0.6) / 0.4))
     expected = logarithm.exp()[:, None] * plain[:, :4]
     torch.testing.assert_close(found[:, :4], expected, rtol=1e-12, atol=0)
     assert torch.equal(found[:, 4:], plain[:, 4:])  # means and opacities as they are
 
 
-def test_a_long_run_has_gsplats_rates_to_the_bit() -> None:
-    for steps in (30_000, 30_001):
-        fitted = rates_over_a_run(steps, OptimizerSettings(length_power=0.5))
-        assert torch.equal(fitted, rates_over_a_run(steps, OptimizerSettings()))
+@pytest.mark.parametrize("steps", [30_000, 30_001])
+def test_a_long_run_has_gsplats_rates_to_the_bit(steps: int) -> None:
+    _, fitted = rates_over_a_run(steps, OptimizerSettings(length_power=0.5))
+    assert torch.equal(fitted, rates_over_a_run(steps, OptimizerSettings())[1])
 
 
 def test_fitted_rates_go_on_after_a_checkpoint() -> None:
     settings = OptimizerSettings(length_power=0.5, length_decay_from=10_000)
     one = optimizer_of(steps=9, settings=settings)
     for seed in range(7):
-        take_step(one, seed)
+        step_of(one, seed)
     other = optimizer_of(steps=9, settings=settings)
     other.load_state_dict(one.state_dict())
     assert other.rates == one.rates != optimizer_of(steps=9, settings=settings).rates
@@ -160,15 +149,41 @@ def test_fitted_rates_go_on_after_a_checkpoint() -> None:
 
 def test_a_skipped_step_moves_nothing_and_the_rate_goes_on() -> None:
     skipping, other = optimizer_of(steps=8), optimizer_of(steps=8)
-    take_step(skipping, 1)
+    step_of(skipping, 1)
     before = {name: skipping.gaussians[name].detach().clone() for name in PARAMETERS}
     skipping.skip_step()
     assert all(torch.equal(skipping.gaussians[name], before[name]) for name in PARAMETERS)
-    take_step(other, 1)
-    take_step(other, 2)
+    step_of(other, 1)
+    step_of(other, 2)
     assert skipping.steps_done == other.steps_done == 2
     assert skipping.rates["means"] == other.rates["means"]
     assert skipping.adam["means"]["step"] == 1  # of Adam's own steps
+
+
+@pytest.mark.parametrize("sh_degree", [0, 1, 3])
+def test_the_gradient_of_harmonics_follows_from_that_of_sh0(sh_degree: int) -> None:
+    """Against autograd through the rasterizer."""
+    camera = make_camera(turned=True)
+    scene = make_scene(30, camera)
+    gaussians = Gaussians(**{name: value.requires_grad_() for name, value in scene.items()})
+    render = draw(vars(gaussians), camera, sh_degree=sh_degree)
+    torch.autograd.backward(render.image.square().sum())
+    expected = gaussians.shN.grad
+    assert expected is not None
+    assert bool(expected.any()) == (sh_degree > 0)
+    optimizer = SplatOptimizer(gaussians, OptimizerSettings(), scene_scale=1.0, steps=10)
+    gaussians.shN.grad = None
+    optimizer.step(camera, sh_degree=sh_degree)
+    assert gaussians.shN.grad is not None
+    torch.testing.assert_close(gaussians.shN.grad, expected, rtol=1e-12, atol=1e-14)
+
+
+def test_without_a_gradient_of_sh0_harmonics_stay(backend: str) -> None:
+    optimizer = optimizer_of(dtype=torch.float32, backend=backend)
+    before = optimizer.gaussians.shN.detach().clone()
+    take_step(optimizer, {"means": torch.ones(5, 3)}, make_camera(), 3)
+    assert optimizer.gaussians.shN.grad is None
+    assert torch.equal(optimizer.gaussians.shN, before)
 
 
 def test_the_harmonics_move_at_every_third_step(backend: str) -> None:
@@ -179,10 +194,8 @@ def test_the_harmonics_move_at_every_third_step(backend: str) -> None:
     theirs = torch.optim.Adam([expected], lr=3 * GSPLAT_RATES["shN"], eps=1e-15)
     for step in range(7):
         values = normal_parameters(5, 10 + step, dtype=dtype)
-        optimizer.zero_grad()
-        optimizer.gaussians.sh0.grad = values["sh0"].clone()
         before = optimizer.gaussians.shN.detach().clone()
-        optimizer.step(camera, sh_degree=3)
+        take_step(optimizer, {"sh0": values["sh0"]}, camera, 3)
         after = optimizer.gaussians.shN.detach()
         assert torch.equal(before, after) == (step % 3 != 0)
         if step % 3 == 0:
@@ -213,22 +226,21 @@ def test_schedules_without_meaning_are_refused(name: str, value: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("steps", 0), *(("scene_scale", v) for v in (0.0, -1.0, nan, inf))]
+    ("name", "value"), [("steps", 0), *(("scene_scale", v) for v in (0.0, nan, inf))]
 )
 def test_a_run_without_meaning_is_refused(name: str, value: float) -> None:
-    options: dict[str, Any] = {"scene_scale": 1.0, "steps": 10, name: value}
-    gaussians = gaussians_of(normal_parameters(2, 0))
+    changed: dict[str, Any] = {name: value}
     with pytest.raises(ValueError, match=name):
-        SplatOptimizer(gaussians, OptimizerSettings(), **options)
+        make_optimizer(normal_parameters(2, 0), **changed)
 
 
 def test_training_goes_on_after_a_change() -> None:
     optimizer = optimizer_of(5)
-    take_step(optimizer, 1)
+    step_of(optimizer, 1)
     optimizer.append(normal_parameters(2, 3, dtype=torch.float64))
     optimizer.keep(torch.tensor([6, 1]))
     first = optimizer.gaussians.scales.detach().clone()
-    gradients = take_step(optimizer, 4)
+    gradients = step_of(optimizer, 4)
     # A new Gaussian's first update, by hand, at the old ones' second step.
     g = gradients["scales"][0]
     mean, square = 0.1 * g / (1 - 0.9**2), 0.001 * g**2 / (1 - 0.999**2)
@@ -242,25 +254,25 @@ def test_changes_before_the_first_step() -> None:
     optimizer.append(normal_parameters(1, 1, dtype=torch.float64))
     optimizer.reset("opacities", torch.zeros(3, dtype=torch.float64))
     assert optimizer.state_bytes() == 0
-    take_step(optimizer, 2)
-    assert moments(optimizer, "means")[0].shape == (3, 3)
+    step_of(optimizer, 2)
+    assert optimizer.adam["means"]["exp_avg"].shape == (3, 3)
 
 
 def test_no_gaussians_left(backend: str) -> None:
     optimizer = optimizer_of(5, dtype=torch.float32, backend=backend)
-    take_step(optimizer, 1)
+    step_of(optimizer, 1)
     optimizer.keep(torch.zeros(5, dtype=torch.bool))
-    take_step(optimizer, 2)
+    step_of(optimizer, 2)
     assert len(optimizer.gaussians) == 0
     assert optimizer.adam["means"]["step"] == 2
     optimizer.append(normal_parameters(2, 3))
-    take_step(optimizer, 4)
+    step_of(optimizer, 4)
     assert optimizer.gaussians.means.isfinite().all()
 
 
 def test_state_is_counted_in_bytes() -> None:
     optimizer = optimizer_of(5, dtype=torch.float32)
-    take_step(optimizer, 1)
+    step_of(optimizer, 1)
     steps = 6 * 4
     assert optimizer.state_bytes() == 2 * 5 * (3 + 4 + 3 + 1 + 3 + 45) * 4 + steps
     optimizer.keep(torch.arange(3))

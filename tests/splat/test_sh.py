@@ -7,7 +7,7 @@ from gsplat.cuda._torch_impl import _spherical_harmonics
 from scipy.special import sph_harm_y
 from torch import Tensor
 
-from xrgs.splat.sh import bases, colors_to_sh0, sh_basis, sh_to_colors
+from xrgs.splat.sh import colors_to_sh0, sh_basis, sh_to_colors
 
 
 @pytest.fixture
@@ -43,20 +43,6 @@ def test_colors_are_gsplats(dirs: Tensor, degree: int) -> None:
     assert (ours == 0).any(), "the clamp must have been tried"
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2])
-def test_bands_that_are_off_do_not_count(dirs: Tensor, degree: int) -> None:
-    generator = torch.Generator().manual_seed(2)
-    shN = torch.randn(len(dirs), 15, 3, generator=generator, dtype=torch.float64)
-    sh0 = torch.ones(len(dirs), 1, 3, dtype=torch.float64)
-    cut = shN.clone()
-    cut[:, bases(degree) - 1 :] = 0
-    on = sh_to_colors(degree, dirs, sh0, shN.requires_grad_())
-    torch.testing.assert_close(on, sh_to_colors(3, dirs, sh0, cut), atol=1e-14, rtol=0)
-    (gradient,) = torch.autograd.grad(on.sum(), shN)
-    assert (gradient[:, bases(degree) - 1 :] == 0).all()
-    assert bool((gradient[:, : bases(degree) - 1] != 0).any()) == (degree > 0)
-
-
 def test_colors_to_sh0_shows_the_color_from_everywhere(dirs: Tensor) -> None:
     colors = torch.rand(len(dirs), 3, dtype=torch.float64)
     shown = sh_to_colors(
@@ -71,19 +57,3 @@ def test_gradient(dirs: Tensor) -> None:
     shN = 0.1 * torch.randn(5, 15, 3, generator=generator, dtype=torch.float64)
     inputs = [value.requires_grad_() for value in (dirs[:5].clone(), sh0, shN)]
     assert torch.autograd.gradcheck(lambda *args: sh_to_colors(3, *args), inputs)
-
-
-@pytest.mark.parametrize(
-    ("degree", "bands", "message"),
-    [
-        (-1, 15, "sh_degree must be 0 to 3"),
-        (4, 15, "sh_degree must be 0 to 3"),
-        (2, 3, r"sh_degree 2 needs shN of \[N, 8, 3\]"),
-        (3, 16, r"shN must be \[N, K - 1, 3\] with K - 1 of at most 15"),
-    ],
-)
-def test_degrees_and_bands_that_do_not_fit(
-    dirs: Tensor, degree: int, bands: int, message: str
-) -> None:
-    with pytest.raises(ValueError, match=message):
-        sh_to_colors(degree, dirs, torch.zeros(len(dirs), 1, 3), torch.zeros(len(dirs), bands, 3))

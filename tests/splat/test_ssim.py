@@ -1,4 +1,7 @@
-"""The SSIM of the training loss against kornia, scikit-image and scipy's Gaussian filter."""
+"""The SSIM of the training loss against kornia and scipy's Gaussian filter.
+
+test_loss.py compares it with scikit-image's.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,7 @@ from xrgs.splat.loss import photometric_loss, prepare_target
 from xrgs.splat.ssim import SIGMA, WINDOW, Target, window_mean, window_moments
 
 
-@pytest.mark.parametrize("size", [(11, 11), (11, 30), (25, 17)])
+@pytest.mark.parametrize("size", [(11, 30), (25, 17)])
 def test_the_mean_is_that_of_scipys_filter(size: tuple[int, int]) -> None:
     image = np.random.default_rng(0).random((*size, 3))
     border = WINDOW // 2
@@ -35,7 +38,7 @@ def test_moments_are_those_of_a_distribution() -> None:
     np.testing.assert_allclose(variance[0, 0], weights @ (samples - mean) ** 2, rtol=1e-10)
 
 
-@pytest.mark.parametrize("height", [31, 42, 43, 100])
+@pytest.mark.parametrize("height", [42, 43, 100])
 def test_a_target_has_the_moments_of_the_whole_image(height: int) -> None:
     """It computes them in blocks of rows, and in double."""
     image = noise(height, 15, seed=height).float()
@@ -50,7 +53,7 @@ def structural_similarity(image: Tensor, target: Target) -> Tensor:
     return 1 - photometric_loss(image, target, l1=0.0, ssim=1.0, backend="torch")
 
 
-@pytest.mark.parametrize("size", [(11, 11), (11, 30), (40, 13), (52, 67)])
+@pytest.mark.parametrize("size", [(11, 11), (40, 13), (52, 67)])
 def test_ssim_is_kornias(size: tuple[int, int]) -> None:
     from kornia.losses import ssim_loss
     from kornia.metrics import ssim
@@ -63,25 +66,6 @@ def test_ssim_is_kornias(size: tuple[int, int]) -> None:
     torch.testing.assert_close(value, expected, rtol=1e-12, atol=0)
     half = ssim_loss(batch, reference, 11, eps=0.0, padding="valid")
     torch.testing.assert_close(1 - value, 2 * half, rtol=1e-12, atol=0)
-
-
-def test_ssim_is_scikit_images() -> None:
-    from skimage.metrics import structural_similarity as skimage_ssim
-
-    image, target = similar_pair(52, 67)
-    # Its mean leaves out the border that the window doesn't fit in.
-    expected = skimage_ssim(
-        image.numpy(),
-        target.numpy(),
-        gaussian_weights=True,
-        sigma=1.5,
-        use_sample_covariance=False,
-        data_range=1.0,
-        channel_axis=-1,
-    )
-    value = structural_similarity(image, prepare_target(target))
-    assert 0.2 < expected < 0.9
-    assert value.item() == pytest.approx(expected, rel=1e-10)
 
 
 @settings(max_examples=25)
@@ -105,11 +89,3 @@ def test_a_variance_below_zero_counts_as_zero() -> None:
         luminance = (2 * level + 1e-4) / (level**2 + 1 + 1e-4)
         value = structural_similarity(image, target)
         assert 0 <= value <= 1.2 * luminance
-
-
-def test_flat_images_have_the_ssim_of_their_levels() -> None:
-    image, target = torch.full((2, 12, 15, 3), 0.0, dtype=torch.float64)
-    image, target = image + 0.25, target + 0.5
-    expected = (2 * 0.25 * 0.5 + 1e-4) / (0.25**2 + 0.5**2 + 1e-4)
-    value = structural_similarity(image, prepare_target(target)).item()
-    assert value == pytest.approx(expected, rel=1e-9)

@@ -68,15 +68,8 @@ def resolve_backend(name: str) -> str:
 def implementation(operation: Operation, backend: str) -> ModuleType:
     """Return the module that implements an operation; it is imported at the first call.
 
-    The modules of an operation have functions of the same names and parameters in all backends.
-
-    Args:
-        operation: The module's name.
-        backend: `torch`, `native`, `gsplat` or `auto`, as for `resolve_backend`.
-
-    Returns:
-        `xrgs.splat.<backend>.<operation>`. The backend gsplat has only `rasterizer`; its other
-        operations are those of torch.
+    The modules of an operation have functions of the same names and parameters in all backends. The
+    backend gsplat has only `rasterizer`; its other operations are those of torch.
 
     Raises:
         ValueError: As for `resolve_backend`.
@@ -91,12 +84,6 @@ def implementation(operation: Operation, backend: str) -> ModuleType:
 def device(backend: str) -> str:
     """Return the device of a backend's tensors, after checking that the backend can render.
 
-    Args:
-        backend: `native`, `torch` or `gsplat`.
-
-    Returns:
-        `cpu`, or `cuda` for gsplat.
-
     Raises:
         XrgsError: The backend is gsplat, and torch sees no GPU, or gsplat's kernels can't be built.
             The message says what is missing.
@@ -108,10 +95,6 @@ def device(backend: str) -> str:
 
 def check_raster(backend: str, raster: RasterSettings) -> None:
     """Refuse settings that differ from the constants of gsplat's kernels.
-
-    Args:
-        backend: `native`, `torch` or `gsplat`.
-        raster: How Gaussians become pixels.
 
     Raises:
         XrgsError: The backend is gsplat, and a setting differs; the message names the setting.
@@ -151,9 +134,6 @@ def arithmetic(backend: str) -> str:
 
     The native kernels give the same bits on all instruction sets with a fused multiply-add, which
     rounds only once. Instruction sets without it round product and sum, and give other bits.
-
-    Args:
-        backend: `native`, `torch` or `gsplat`.
 
     Returns:
         - `fma` or `no-fma`: the instruction set that the native kernels use in this process.

@@ -15,12 +15,9 @@ def bicubic_matrix(old: int, new: int) -> Tensor:
 
     Resampling is linear, so the weights are the interpolated identity matrix. Each row sums to 1.
 
-    Args:
-        old: Number of samples along the axis before resampling.
-        new: Number of samples after resampling.
-
     Returns:
-        [new, old] float64. The matrix is cached: callers must not write to it.
+        [new, old] float64 for numbers of samples before and after resampling. The matrix is cached:
+        callers must not write to it.
     """
     identity = torch.eye(old, dtype=torch.float64)[None, None]  # [1, 1, old, old]
     return interpolate(identity, size=(new, old), mode="bicubic", antialias=True)[0, 0]

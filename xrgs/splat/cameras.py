@@ -103,14 +103,9 @@ class Camera:
         return Camera(self.viewmat, self.K * scale, width, height)
 
     def to_camera(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Transform points from world to camera coordinates.
+        """Return x, y and z [P] each of points [P, 3] in camera coordinates, world units.
 
-        Args:
-            points: [P, 3] world units, float32 or float64.
-
-        Returns:
-            x, y and z [P] each in camera coordinates, world units, of the points' type. z is the
-            depth.
+        They have the points' type; z is the depth.
         """
         first, second = (_along(row, points) for row in self.viewmat[:2])
         return first, second, self.depths(points)

@@ -127,11 +127,8 @@ class Gaussians:
 
         Args:
             backend: `torch`, `native` or `auto` (`resolve_backend`). The native backend takes
-                float32 on the CPU only, and gives the same bits for any number of threads.
-
-        Returns:
-            The Gaussians, differentiable in all parameters except shN, and on the native backend
-            only once.
+                float32 on the CPU only, gives the same bits for any number of threads, and is once
+                differentiable.
 
         Raises:
             ValueError: The parameters are not float32 on the CPU for the native backend.
@@ -152,20 +149,9 @@ def from_points(
 ) -> Gaussians:
     """Place a Gaussian on each SfM point, as `create_splats_with_optimizers` of gsplat's trainer.
 
-    Each Gaussian is isotropic. Its scale is `init_scale` times the RMS distance to the three
-    nearest points. The quaternions are random. Band 0 of the harmonics is the point's colour, the
-    other bands are 0.
-
-    Args:
-        points: [P, 3] world units.
-        colors: [P, 3], 8-bit, or floats in 0..1.
-        init_opacity: Opacity of every Gaussian, above 0 and below 1.
-        init_scale: Factor of the scale of every Gaussian, above 0.
-        sh_degree: Highest stored band of the spherical harmonics, 0 to 3.
-        generator: Draws the quaternions.
-
-    Returns:
-        P Gaussians, float32 leaf tensors that require gradients.
+    Each Gaussian is isotropic. Its scale is `init_scale`, above 0, times the RMS distance to the
+    three nearest points. The quaternions are random. Band 0 of the harmonics is the point's colour,
+    the other bands are 0. The other arguments and the result are those of `Gaussians.from_points`.
 
     Raises:
         ValueError: There are fewer than 4 points, shapes do not fit, values are not finite, or

@@ -75,13 +75,8 @@ def similarity_from_cameras(viewmats: Array) -> Array:
 
     Each camera's point is the one on its optical axis nearest to the origin, after the turn. The
     focus is the median of these points, as in gsplat's `center_method="focus"`. The median distance
-    of the cameras from the focus becomes 1.
-
-    Args:
-        viewmats: [C, 4, 4] world to camera, rigid.
-
-    Returns:
-        [4, 4] from the old world to the new one.
+    of the cameras from the focus becomes 1. Viewmats are [C, 4, 4], the similarity is [4, 4] from
+    the old world to the new one.
     """
     up = -viewmats[:, 1, :3].mean(axis=0)
     turn = rotation_between(up / np.linalg.norm(up), np.array([0.0, -1.0, 0.0]))
@@ -136,16 +131,9 @@ def transform_points(transform: Array, points: Array) -> Array:
 
 
 def transform_viewmats(transform: Array, viewmats: Array) -> Array:
-    """Return the viewmats of the same cameras in a transformed world.
+    """Return the viewmats [C, 4, 4] of the same cameras in a world transformed by a similarity.
 
     The viewmats stay rigid: the scale of the transform goes into the translations.
-
-    Args:
-        transform: [4, 4] similarity from the old world to the new one.
-        viewmats: [C, 4, 4] old world to camera, rigid.
-
-    Returns:
-        [C, 4, 4] new world to camera, rigid.
     """
     scale = np.cbrt(np.linalg.det(transform[:3, :3]))
     transformed: Array = viewmats @ np.linalg.inv(transform)  # new world to old camera

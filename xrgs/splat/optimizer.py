@@ -30,22 +30,19 @@ class SplatOptimizer:
     where t0 is `means_decay_from * steps / 30,000`, 0 in gsplat. DashGaussian [chen2025dash] starts
     the decay later, after its steps at a reduced resolution.
 
-    gsplat's rates are meant for 30,000 steps. Adam moves a log scale by at most about its rate at
-    each step, so 600 steps at 0.005 change a scale by at most a factor of e^3. The initial scales,
-    from the spacing of the SfM points, are often ten times too large. With `length_power` of p, the
-    rates of scales, quats, sh0 and shN in a run of T steps, T below 30,000, are
+    gsplat's rates are meant for 30,000 steps. With `length_power` of p, the rates of scales, quats,
+    sh0 and shN in a run of T steps, T below 30,000, are (docs/training.md has the reasons)
 
         rate(t) = rate * (30,000 / T)^(p * min(1, (T - t) / (T - t1)))
 
-    where t1 is `length_decay_from * T / 30,000`. They are constant up to t1, then fall
-    exponentially and reach gsplat's rates after the last step, so that the noise of large steps
-    settles. In runs of 30,000 steps or more they are gsplat's. Our choice: a random walk of T steps
-    gets as far as rate * sqrt(T), which p = 0.5 keeps constant. reports/rates compares powers.
+    where t1 is `length_decay_from * T / 30,000`: constant up to t1, then falling exponentially to
+    gsplat's rates after the last step. In longer runs they are gsplat's. Our choice: reports/rates
+    compares powers.
 
     With `shN_every` of k, shN and its moments are updated only at every k-th step, starting with
-    the first, by the gradient of that step and at k times the rate. Our choice: it saves computing
-    the gradients of the other steps. Adam's steps do not depend on the size of the gradient, so a
-    coefficient with a gradient of constant sign moves as far as with k = 1.
+    the first, by the gradient of that step and at k times the rate. Our choice, to save the
+    gradients of the other steps. Adam's steps do not depend on the gradient's size: a coefficient
+    with a gradient of constant sign moves as far as with k = 1.
 
     Gaussians are added and removed only through `append` and `keep`, so that parameters and state
     always fit. New Gaussians start with moments of zero and the step count of the others, as in
@@ -80,8 +77,7 @@ class SplatOptimizer:
             settings: Learning rates and Adam's constants.
             scene_scale: Extent of the scene in world units, above 0.
             steps: Number of steps of the whole run, at least 1.
-            backend: Backend that computes the steps: `torch`, `native`, `gsplat` or `auto`
-                (`resolve_backend`).
+            backend: Backend that computes the steps (`resolve_backend`).
 
         Raises:
             ValueError: `scene_scale` or `steps` is not above 0, or a setting is out of its range.
@@ -179,20 +175,13 @@ class SplatOptimizer:
         return sum(value.nbytes for state in self.adam.values() for value in state.values())
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the state for a checkpoint.
-
-        Returns:
-            `gaussians`: name -> parameter; `adam`: name -> Adam state, empty before the first step
-            of the parameter; `steps_done`.
-        """
+        """Return the state for a checkpoint: `gaussians` and `adam` by name, and `steps_done`."""
         values = {name: self.gaussians[name].detach() for name in PARAMETERS}
         adam = {name: dict(self.adam[name]) for name in PARAMETERS}
         return {"gaussians": values, "adam": adam, "steps_done": self.steps_done}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore Gaussians, moments and learning rates; drop gradients.
-
-        The number of Gaussians may differ from the present one.
+        """Restore any number of Gaussians, moments and learning rates; drop gradients.
 
         Raises:
             KeyError: A parameter or moment is missing.
@@ -219,11 +208,7 @@ class SplatOptimizer:
         self._set_rates()
 
     def keep(self, index: Tensor) -> None:
-        """Keep only the Gaussians of `index`, with their moments.
-
-        Args:
-            index: The Gaussians to keep: [N] bool, or [M] int64 indices in their new order.
-        """
+        """Keep only the Gaussians of `index`: [N] bool, or [M] int64 in their new order."""
         if index.dtype == torch.bool:
             index = index.nonzero()[:, 0]
         for name in PARAMETERS:
@@ -232,11 +217,7 @@ class SplatOptimizer:
             self._replace(name, values, lambda moment: moment.index_select(0, index))
 
     def append(self, new: Mapping[str, Tensor]) -> None:
-        """Append Gaussians, with moments of zero.
-
-        Args:
-            new: Raw parameters [M, ...] for each name of `PARAMETERS`.
-        """
+        """Append Gaussians by their raw parameters [M, ...], with moments of zero."""
         count = len(new["means"])
 
         def lengthen(moment: Tensor) -> Tensor:

@@ -165,15 +165,10 @@ def rasterize_parameters(
 
 
 def zero_means2d_offset(count: int, device: torch.device = _CPU) -> Tensor:
-    """Return a zero `means2d_offset`, whose `grad` becomes the image-plane gradient.
+    """Return a zero `means2d_offset` [N, 2], whose `grad` becomes the image-plane gradient.
 
-    Args:
-        count: The number of Gaussians, N.
-        device: Device of the Gaussians.
-
-    Returns:
-        [N, 2] float32 leaf that requires a gradient. All its elements share one number in memory,
-        by which the native backend recognises the zeros and skips reading them.
+    All its elements share one number in memory, by which the native backend recognises the zeros
+    and skips reading them.
     """
     return _zero(device).expand(count, 2).requires_grad_()
 
@@ -190,14 +185,7 @@ def _zero(device: torch.device) -> Tensor:
 
 
 def backend_for(means: Tensor, backend: str) -> str:
-    """Choose the backend for Gaussians of this floating type.
-
-    Args:
-        means: Any parameter of the Gaussians.
-        backend: `native`, `torch`, `gsplat` or `auto`.
-
-    Returns:
-        `backend`, except for `auto` and a type other than float32: `torch`.
+    """Return `backend`, except for `auto` and means of a type other than float32: `torch`.
 
     Raises:
         ValueError: The tensor is on another device than the backend's.

@@ -30,11 +30,7 @@ def check_degree(degree: int) -> None:
 
 
 def check_sh_degree(degree: int, shN: Tensor) -> None:
-    """Check that the stored coefficients suffice for a degree.
-
-    Args:
-        degree: Highest band that is on.
-        shN: [N, K - 1, 3] coefficients of the bands above 0.
+    """Check that the stored coefficients [N, K - 1, 3] suffice for a degree.
 
     Raises:
         ValueError: The degree is not 0 to 3, or shN has fewer bands than it needs or more than
@@ -51,17 +47,14 @@ def check_sh_degree(degree: int, shN: Tensor) -> None:
 
 
 def sh_basis(degree: int, dirs: Tensor) -> Tensor:
-    """Evaluate the real spherical harmonics of degree 0 to `degree`.
+    """Evaluate the real spherical harmonics of degree 0 to `degree`, at most 3.
 
     Args:
-        degree: Highest degree, 0 to 3.
+        degree: Highest degree.
         dirs: [..., 3] directions of unit length.
 
     Returns:
         [..., (degree + 1)^2]
-
-    Raises:
-        ValueError: The degree is not 0 to 3.
     """
     check_degree(degree)
     x, y, z = dirs.unbind(-1)
@@ -119,12 +112,5 @@ def sh_to_colors(degree: int, dirs: Tensor, sh0: Tensor, shN: Tensor) -> Tensor:
 
 
 def colors_to_sh0(colors: Tensor) -> Tensor:
-    """Return the band 0 coefficients of colours that do not depend on the view.
-
-    Args:
-        colors: [N, 3] in 0..1.
-
-    Returns:
-        [N, 1, 3]
-    """
+    """Return the band 0 coefficients [N, 1, 3] of colours [N, 3] that every view shows."""
     return ((colors - 0.5) / C0)[:, None]

@@ -37,14 +37,7 @@ class Target:
 
 
 def window_mean(image: Tensor) -> Tensor:
-    """Return the weighted mean of every window that lies inside the image.
-
-    Args:
-        image: [H, W, C], at least `WINDOW` px along each axis.
-
-    Returns:
-        [H - 10, W - 10, C]
-    """
+    """Return the weighted mean [H - 10, W - 10, C] of every window inside an image [H, W, C]."""
     channels = image.shape[-1]
     kernel = image.new_tensor(WEIGHTS)  # [11]
     # `image[None].permute`, not `image.permute()[None]`: only then does oneDNN treat the tensor as
@@ -57,13 +50,9 @@ def window_mean(image: Tensor) -> Tensor:
 
 
 def window_moments(image: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the weighted mean and variance of every window that lies inside the image.
+    """Return the weighted mean and variance of every window inside an image [H, W, C].
 
-    Args:
-        image: [H, W, C], at least `WINDOW` px along each axis.
-
-    Returns:
-        Mean and variance, [H - 10, W - 10, C] each. A variance that rounding makes negative is 0.
+    Both are [H - 10, W - 10, C]. A variance that rounding makes negative is 0.
     """
     # Summed in a fixed order. A convolution's order depends on the processor, which would change
     # many digits of a variance, since it is a small difference of squares.

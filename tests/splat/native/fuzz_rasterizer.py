@@ -26,6 +26,7 @@ from tests.splat.native import oracle
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import PARAMETERS, ActivatedGaussians
 from xrgs.splat.native.rasterizer import render_culled
+from xrgs.splat.quaternions import rotation_matrices
 from xrgs.splat.rendering import Render
 from xrgs.splat.settings import CullingOptions, RasterSettings
 
@@ -90,8 +91,11 @@ class Draw:
     def one_of(self, *values: float) -> float:
         return self.random.choice(values)
 
+    def share(self) -> float:
+        return self.random.random()
+
     def chance(self, probability: float) -> bool:
-        return self.random.random() < probability
+        return self.share() < probability
 
 
 # --- hostile cases: each changes a plain scene --------------------------------------------------
@@ -99,13 +103,27 @@ class Draw:
 Case = Callable[[Draw, Scene], None]
 
 
-def fill(name: str, *values: float) -> Case:
-    """Sets every value of a tensor to one of these numbers."""
+def change(name: str, function: Callable[[Draw, Tensor], Tensor]) -> Case:
+    """Replaces a tensor by a function of it."""
 
     def case(draw: Draw, scene: Scene) -> None:
-        getattr(scene, name)[:] = draw.one_of(*values)
+        setattr(scene, name, function(draw, getattr(scene, name)))
 
     return case
+
+
+def change_depths(function: Callable[[Draw, Tensor], Tensor | float]) -> Case:
+    """Replaces the depths of the means, in the tensor."""
+
+    def case(draw: Draw, scene: Scene) -> None:
+        scene.means[:, 2] = function(draw, scene.means[:, 2])
+
+    return case
+
+
+def fill(name: str, *values: float) -> Case:
+    """Sets every value of a tensor to one of these numbers."""
+    return change(name, lambda draw, value: torch.full_like(value, draw.one_of(*values)))
 
 
 def multiply(names: str, *factors: float) -> Case:
@@ -121,13 +139,10 @@ def multiply(names: str, *factors: float) -> Case:
 
 def spread(name: str, decades: float) -> Case:
     """Multiplies each row of a tensor by a random power of ten."""
-
-    def case(draw: Draw, scene: Scene) -> None:
-        value: Tensor = getattr(scene, name)
-        factor = 10 ** (draw.normal(len(value), 1) * decades).clamp(-37, 37)
-        setattr(scene, name, value * factor)
-
-    return case
+    return change(
+        name,
+        lambda draw, value: value * 10 ** (draw.normal(len(value), 1) * decades).clamp(-37, 37),
+    )
 
 
 def setting(name: str, *values: float) -> Case:
@@ -139,62 +154,21 @@ def setting(name: str, *values: float) -> Case:
     return case
 
 
-def means_near(draw: Draw, scene: Scene) -> None:
-    distance = (draw.uniform(len(scene.means)) - 0.5) * 10 ** (-3 - 3 * draw.random.random())
-    scene.means[:, 2] = 0.01 + distance
+def focal(*values: float) -> Case:
+    """Sets both focal lengths to one of these numbers."""
 
+    def case(draw: Draw, scene: Scene) -> None:
+        scene.K[0, 0] = scene.K[1, 1] = draw.one_of(*values)
 
-def means_on_the_camera_plane(draw: Draw, scene: Scene) -> None:
-    scene.means[:, 2] = draw.one_of(0.0, 1e-38, 1e-45, -1e-30, 0.01)
-
-
-def means_behind(draw: Draw, scene: Scene) -> None:
-    scene.means[:, 2] *= torch.sign(draw.normal(len(scene.means)))
-
-
-def means_on_the_axis(draw: Draw, scene: Scene) -> None:
-    scene.means[:, :2] = 0
-
-
-def means_all_the_same(draw: Draw, scene: Scene) -> None:
-    scene.means[:] = scene.means[:1].clone()
-
-
-def scales_of_all_sizes(draw: Draw, scene: Scene) -> None:
-    scene.scales = 10 ** (draw.normal(*scene.scales.shape) * 10).clamp(-38, 38)
+    return case
 
 
 def scales_flat(draw: Draw, scene: Scene) -> None:
     scene.scales[:, draw.random.randrange(3)] = 0
 
 
-def scales_of_needles(draw: Draw, scene: Scene) -> None:
-    scene.scales *= torch.tensor([1e5, 1e-5, 1e-5])
-
-
-def opacities_at_the_threshold(draw: Draw, scene: Scene) -> None:
-    scene.opacities = (1 + (draw.uniform(len(scene.means)) - 0.5) * 1e-6) / 255
-
-
-def opacities_zero_or_one(draw: Draw, scene: Scene) -> None:
-    scene.opacities = scene.opacities.round()
-
-
 def camera_far_away(draw: Draw, scene: Scene) -> None:
     scene.viewmat[:3, 3] *= draw.one_of(1e4, 1e15, 1e30)
-
-
-def focal_tiny(draw: Draw, scene: Scene) -> None:
-    scene.K[0, 0] = scene.K[1, 1] = draw.one_of(1e-3, 1e-10, 1e-30)
-
-
-def focal_huge(draw: Draw, scene: Scene) -> None:
-    scene.K[0, 0] = scene.K[1, 1] = draw.one_of(1e5, 1e10, 1e18, 1e30)
-
-
-def focal_of_two_sizes(draw: Draw, scene: Scene) -> None:
-    scene.K[0, 0] *= 1e4
-    scene.K[1, 1] *= 1e-4
 
 
 def centre_far_away(draw: Draw, scene: Scene) -> None:
@@ -220,21 +194,29 @@ def image_gradients_expanded(draw: Draw, scene: Scene) -> None:
 
 GROUPS: tuple[Mapping[str, Case], ...] = (
     {
-        "means near the near plane": means_near,
-        "means on the camera's plane": means_on_the_camera_plane,
-        "means behind": means_behind,
+        "means near the near plane": change_depths(
+            lambda draw, z: 0.01 + (draw.uniform(len(z)) - 0.5) * 10 ** (-3 - 3 * draw.share())
+        ),
+        "means on the camera's plane": change_depths(
+            lambda draw, _: draw.one_of(0.0, 1e-38, 1e-45, -1e-30, 0.01)
+        ),
+        "means behind": change_depths(lambda draw, z: z * torch.sign(draw.normal(len(z)))),
         "means huge": multiply("means", 1e10, 1e18, 1e19, 1e20, 1e30, 3e37),
         "means of all sizes": spread("means", 12),
-        "means on the axis": means_on_the_axis,
-        "means all the same": means_all_the_same,
+        "means on the axis": change("means", lambda _, means: means * torch.tensor([0.0, 0, 1])),
+        "means all the same": change("means", lambda _, means: means[:1].repeat(len(means), 1)),
     },
     {
         "scales zero": fill("scales", 0),
         "scales tiny": fill("scales", 1e-45, 1e-30, 1e-20, 1e-10),
         "scales huge": multiply("scales", 1e2, 1e4, 1e6, 1e10, 1e18, 1e30),
-        "scales of all sizes": scales_of_all_sizes,
+        "scales of all sizes": change(
+            "scales", lambda draw, scales: 10 ** (draw.normal(*scales.shape) * 10).clamp(-38, 38)
+        ),
         "scales flat": scales_flat,
-        "scales of needles": scales_of_needles,
+        "scales of needles": change(
+            "scales", lambda _, scales: scales * torch.tensor([1e5, 1e-5, 1e-5])
+        ),
     },
     {
         "quats zero": fill("quats", 0),
@@ -244,15 +226,19 @@ GROUPS: tuple[Mapping[str, Case], ...] = (
     },
     {
         "opacities all alike": fill("opacities", 0, 1, 1e-42),
-        "opacities at the threshold": opacities_at_the_threshold,
-        "opacities zero or one": opacities_zero_or_one,
+        "opacities at the threshold": change(
+            "opacities", lambda draw, o: (1 + (draw.uniform(len(o)) - 0.5) * 1e-6) / 255
+        ),
+        "opacities zero or one": change("opacities", lambda _, opacities: opacities.round()),
     },
     {"colours huge or zero": multiply("sh0 shN", 1e6, 1e15, 1e30, 1e38, 0)},
     {"camera far away": camera_far_away},
     {
-        "focal length tiny": focal_tiny,
-        "focal length huge": focal_huge,
-        "focal lengths of two sizes": focal_of_two_sizes,
+        "focal length tiny": focal(1e-3, 1e-10, 1e-30),
+        "focal length huge": focal(1e5, 1e10, 1e18, 1e30),
+        "focal lengths of two sizes": change(
+            "K", lambda _, K: K * torch.tensor([[1e4, 1, 1], [1, 1e-4, 1], [1, 1, 1]])
+        ),
         "principal point far away": centre_far_away,
     },
     {"offsets huge": offsets_huge},
@@ -339,16 +325,9 @@ def _plain_scene(draw: Draw) -> Scene:
 
 
 def _random_pose(draw: Draw) -> Tensor:
-    w, x, y, z = torch.nn.functional.normalize(draw.normal(4).double(), dim=0).tolist()
-    turn = torch.tensor(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
     pose = torch.eye(4)
-    pose[:3, :3], pose[:3, 3] = turn, draw.normal(3)
+    pose[:3, :3] = rotation_matrices(draw.normal(1, 4).double())[0]
+    pose[:3, 3] = draw.normal(3)
     return pose
 
 
@@ -365,15 +344,6 @@ def _place_in_world(scene: Scene) -> None:
 
 
 # --- checks -------------------------------------------------------------------------------------
-
-
-class FuzzError(Exception):
-    """A scene gives what it must not; the message says what."""
-
-
-def require(condition: bool | Tensor, message: str) -> None:
-    if not condition:
-        raise FuzzError(message)
 
 
 def render(scene: Scene) -> tuple[Render, dict[str, Tensor]]:
@@ -405,21 +375,22 @@ def gradients_of(scene: Scene, rendered: Render, leaves: Mapping[str, Tensor]) -
 
 
 def check_scene(scene: Scene, *, compare: bool = False) -> str | None:
-    """Check what a scene gives; return the message of the error where it is refused, else None.
-
-    Raises:
-        FuzzError: A value is not finite or out of range, an error names nothing, a plain scene is
-            refused, or differs from torch's.
-    """
+    """Assert what a scene must give; return the message of the error where it is refused."""
+    refusal = None
     try:
         rendered, leaves = render(scene)
         check_image(rendered)
         gradients = gradients_of(scene, rendered, leaves)
     except (ValueError, MemoryError) as error:
-        require(bool(scene.cases), f"a plain scene is refused: {error}")
-        require(REFUSAL.match(str(error)) is not None, f"an error that names nothing: {error}")
-        return str(error)
-    check_gradients(gradients, rendered.visible)
+        refusal = str(error)
+    if refusal is not None:
+        assert scene.cases, f"a plain scene is refused: {refusal}"
+        assert REFUSAL.match(refusal), f"an error that names nothing: {refusal}"
+        return refusal
+    for name, gradient in gradients.items():
+        assert torch.isfinite(gradient).all(), f"the gradient of {name} is silently not finite"
+        hidden = gradient[~rendered.visible]
+        assert (hidden == 0).all(), f"what is not visible has a gradient of {name}"
     if compare and LOSSY.isdisjoint(scene.cases):
         compare_with_torch(scene, rendered)
     return None
@@ -427,31 +398,18 @@ def check_scene(scene: Scene, *, compare: bool = False) -> str | None:
 
 def check_image(rendered: Render) -> None:
     image, alpha = rendered.image.detach(), rendered.alpha.detach()
-    require(torch.isfinite(image).all(), "the image is not finite")
-    require((image >= 0).all(), "the image is below 0")
-    require(((alpha >= 0) & (alpha <= 1)).all(), "alpha is not in 0..1")
-
-
-def check_gradients(gradients: Mapping[str, Tensor], visible: Tensor) -> None:
-    for name, gradient in gradients.items():
-        require(torch.isfinite(gradient).all(), f"the gradient of {name} is silently not finite")
-        require((gradient[~visible] == 0).all(), f"what is not visible has a gradient of {name}")
+    assert torch.isfinite(image).all(), "the image is not finite"
+    assert (image >= 0).all(), "the image is below 0"
+    assert ((alpha >= 0) & (alpha <= 1)).all(), "alpha is not in 0..1"
 
 
 def compare_with_torch(scene: Scene, rendered: Render) -> None:
-    """Compare a plain scene as test_rasterizer.py does; of a hostile one, the image alone.
-
-    Raises:
-        FuzzError: The image or, of a plain scene, a gradient differs by more than rounding.
-    """
+    """Compare a plain scene as test_rasterizer.py does; of a hostile one, the image alone."""
     if _near_plane_is_close(scene):
         return
     arguments = scene.tensors(), scene.camera, scene.settings
     if not scene.cases:
-        try:
-            oracle.compare(*arguments, sh_degree=scene.sh_degree)
-        except AssertionError as failure:
-            raise FuzzError(f"a plain scene differs from torch's: {failure}") from failure
+        oracle.compare(*arguments, sh_degree=scene.sh_degree)
         return
     exact, single = (
         oracle.run(*arguments, "torch", dtype, sh_degree=scene.sh_degree)[0].image.detach()
@@ -460,7 +418,7 @@ def compare_with_torch(scene: Scene, rendered: Render) -> None:
     error, allowed = ((each - exact).abs().max() for each in (rendered.image.detach(), single))
     scale = max(1.0, float(exact.max()))
     bound = oracle.FACTOR * allowed + (_threshold_step(scene.settings) + 1e-5) * scale
-    require(error <= bound, f"the image errs by {error:.2g}")
+    assert error <= bound, f"the image errs by {error:.2g}"
 
 
 def _near_plane_is_close(scene: Scene) -> bool:
@@ -481,32 +439,24 @@ def _threshold_step(settings: RasterSettings) -> float:
 # --- the command --------------------------------------------------------------------------------
 
 
-def fuzz(
-    seeds: Iterable[int], compare_every: int, report: Callable[[int], None]
-) -> dict[str, list[int]]:
+def fuzz(seeds: Iterable[int], compare_every: int) -> dict[str, list[int]]:
     """Check the scenes of some seeds; return the errors with the seeds that were refused.
 
-    A scene whose seed is a multiple of `compare_every` is compared with torch.
-
-    Raises:
-        FuzzError: As `check_scene` raises it, with the seed and the cases of the scene.
+    A scene whose seed is a multiple of `compare_every` is compared with torch. An AssertionError
+    names the seed of the scene and its cases.
     """
     refused: defaultdict[str, list[int]] = defaultdict(list)
     for seed in seeds:
         scene = random_scene(seed)
         try:
             error = check_scene(scene, compare=seed % compare_every == 0)
-        except FuzzError as failure:
-            raise FuzzError(f"seed {seed} ({', '.join(scene.cases)}): {failure}") from failure
+        except AssertionError as failure:
+            raise AssertionError(f"seed {seed} ({', '.join(scene.cases)}): {failure}") from failure
         if error is not None:
             refused[error].append(seed)
-        report(seed)
+        if (seed + 1) % 10_000 == 0:
+            print(f"{seed + 1} done", flush=True)  # noqa: T201
     return refused
-
-
-def _report_progress(seed: int) -> None:
-    if (seed + 1) % 10_000 == 0:
-        print(f"{seed + 1} done", flush=True)  # noqa: T201
 
 
 def main(arguments: list[str]) -> int:
@@ -518,8 +468,8 @@ def main(arguments: list[str]) -> int:
     torch.set_num_threads(1)  # the scenes are tiny
     seeds = range(options.seed, options.seed + options.count)
     try:
-        refused = fuzz(seeds, options.compare_every, _report_progress)
-    except FuzzError as error:
+        refused = fuzz(seeds, options.compare_every)
+    except AssertionError as error:
         print(error)  # noqa: T201
         return 1
     total = sum(len(of_one) for of_one in refused.values())

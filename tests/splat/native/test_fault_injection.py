@@ -5,11 +5,11 @@ Only a build with fault injection can do this; `tests/csrc/sanitize.sh` makes on
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -104,123 +104,85 @@ def test_backward(view: tuple[Any, Results]) -> None:
     assert_every_failure_is_an_error(run, at_least=8)
 
 
-def test_a_frame_is_used_again_after_a_failure(view: tuple[Any, Results]) -> None:
-    config, parameters = view
-    frame, other = native.Frame(), native.Frame()
-    expected = other.forward(config, *parameters, None, THREADS)
-    v_image, v_alpha = torch.ones(160, 160, 3), torch.ones(160, 160)
-    for number in itertools.count(1):
-        native.delete_unused_frames()
-        native.fail_allocation(number)
-        with contextlib.suppress(MemoryError):
-            frame.forward(config, *parameters, None, THREADS)
-        reached = native.allocation_failed()
-        native.fail_allocation(0)
-        if not reached:
-            break
-        with pytest.raises(ValueError, match="the frame has no render"):
-            frame.backward(v_image, v_alpha, *parameters, None, True, THREADS)
-        with pytest.raises(ValueError, match="the frame has no render"):
-            frame.visible()
-        image, alpha = frame.forward(config, *parameters, None, THREADS)
-        assert torch.equal(image, expected[0])
-        assert torch.equal(alpha, expected[1])
-        frame = native.Frame()  # the next failure, from the start
-    assert number > 5
+def random(*shapes: tuple[int, ...]) -> Iterator[Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    return (torch.rand(shape, generator=generator) for shape in shapes)
 
 
-@pytest.mark.parametrize("weighted", [False, True])
-def test_loss(weighted: bool) -> None:
-    g = torch.Generator().manual_seed(0)
-    image, target = torch.rand(2, 80, 48, 3, generator=g)
-    mean, variance = torch.rand(2, 70, 38, 3, generator=g)
-    weight = torch.rand(80, 48, generator=g) if weighted else None
-
-    def run() -> Results:
-        value, gradient = native.photometric_loss(
-            image, target, mean, variance, weight, 0.8, 0.2, True, THREADS
-        )
-        return [torch.tensor(value, dtype=torch.float64), gradient]
-
-    assert_every_failure_is_an_error(run, at_least=4)
+def loss(*, weighted: bool) -> Results:
+    image, target, mean, variance, weight = random(*[(80, 48, 3)] * 2, *[(70, 38, 3)] * 2, (80, 48))
+    value, gradient = native.photometric_loss(
+        image, target, mean, variance, weight if weighted else None, 0.8, 0.2, True, THREADS
+    )
+    return [torch.tensor(value, dtype=torch.float64), gradient]
 
 
-@pytest.mark.parametrize("name", ["exp", "logistic"])
-def test_activations(name: str) -> None:
+def activation(name: str) -> Results:
     x = torch.linspace(-5, 5, 40_000)
-
-    def run() -> Results:
-        y = getattr(native, name)(x, THREADS)
-        return [y, getattr(native, f"{name}_backward")(x, y, THREADS)]
-
-    assert_every_failure_is_an_error(run, at_least=4)
+    y = getattr(native, name)(x, THREADS)
+    return [y, getattr(native, f"{name}_backward")(x, y, THREADS)]
 
 
-def test_adam() -> None:
-    start = torch.linspace(-1, 1, 40_000)
-
-    def run() -> Results:
-        tensors = [start.clone(), start.clone(), torch.zeros(40_000), torch.zeros(40_000)]
-        before = [tensor.clone() for tensor in tensors]
-        try:
-            native.adam_step([(*tensors, 0.1, 1.0)], 0.9, 0.999, 1e-15, THREADS)
-        except MemoryError:
-            assert all(torch.equal(a, b) for a, b in zip(tensors, before, strict=True))
-            raise
-        return tensors
-
-    assert_every_failure_is_an_error(run, at_least=2)
+def adam() -> Results:
+    tensors = [*random(*[(40_000,)] * 2), *torch.zeros(2, 40_000)]
+    before = [tensor.clone() for tensor in tensors]
+    try:
+        native.adam_step([(*tensors, 0.1, 1.0)], 0.9, 0.999, 1e-15, THREADS)
+    except MemoryError:
+        assert all(torch.equal(a, b) for a, b in zip(tensors, before, strict=True))
+        raise
+    return tensors
 
 
-def test_adam_of_harmonics() -> None:
-    g = torch.Generator().manual_seed(0)
-    start, means, gradient = (
-        torch.randn(2000, *shape, generator=g) for shape in ((15, 3), (3,), (1, 3))
-    )
-
-    def run() -> Results:
-        tensors = [start.clone(), torch.zeros_like(start), torch.zeros_like(start)]
-        harmonics = (*tensors, means, gradient, [0.0, 0.0, -9.0], 3, 0.1, 1.0)
-        native.adam_step([], 0.9, 0.999, 1e-15, THREADS, harmonics)
-        return tensors
-
-    assert_every_failure_is_an_error(run, at_least=0)
+def adam_of_harmonics() -> Results:
+    start, means, gradient = random((2000, 15, 3), (2000, 3), (2000, 1, 3))
+    tensors = [start, torch.zeros_like(start), torch.zeros_like(start)]
+    harmonics = (*tensors, means, gradient, [0.0, 0.0, -9.0], 3, 0.1, 1.0)
+    native.adam_step([], 0.9, 0.999, 1e-15, THREADS, harmonics)
+    return tensors
 
 
-def test_densification_statistics() -> None:
+def statistics() -> Results:
     gradient, visible = torch.ones(40_000, 2), torch.ones(40_000, dtype=torch.bool)
-
-    def run() -> Results:
-        sums = [torch.zeros(40_000), torch.zeros(40_000)]
-        native.accumulate_grad2d(gradient, visible, 1.0, 1.0, *sums, THREADS)
-        return sums
-
-    assert_every_failure_is_an_error(run, at_least=0)
+    sums = [torch.zeros(40_000), torch.zeros(40_000)]
+    native.accumulate_grad2d(gradient, visible, 1.0, 1.0, *sums, THREADS)
+    return sums
 
 
-@pytest.mark.parametrize("size", [(20, 30), (90, 70)])
-def test_resample(size: tuple[int, int]) -> None:
-    image = torch.rand(50, 40, 3, generator=torch.Generator().manual_seed(0))
-    matrices = *banded_matrix(50, size[0]), *banded_matrix(40, size[1])
-    assert_every_failure_is_an_error(
-        lambda: [native.resample(image, *matrices, THREADS)], at_least=3
-    )
+def resample(height: int, width: int) -> Results:
+    matrices = *banded_matrix(50, height), *banded_matrix(40, width)
+    return [native.resample(*random((50, 40, 3)), *matrices, THREADS)]
 
 
-def test_plane_sweep() -> None:
+def plane_sweep() -> Results:
     image = np.random.default_rng(0).random((20, 30)).astype(np.float32)
     padded = np.pad(image, ((0, 1), (0, 1)), mode="edge")
     directions = np.stack([image, image, np.ones_like(image)])
     shift, depths = np.ones(3, np.float32), np.ones((2, 1, 1), np.float32)
     other = ([directions], [shift], [padded], [np.empty((0, 0), bool)])
+    costs, sums = (np.empty((2, 20, 30), np.float32) for _ in range(2))
+    native.plane_sweep_costs([image] * 4, *other, depths, 1, 1e-5, 1e-6, costs)
+    native.semiglobal_sums(costs, 0.2, 0.015, sums)
+    return [torch.from_numpy(costs), torch.from_numpy(sums)]
 
-    def run() -> Results:
-        costs, sums = (np.empty((2, 20, 30), np.float32) for _ in range(2))
-        native.plane_sweep_costs([image] * 4, *other, depths, 1, 1e-5, 1e-6, costs)
-        native.semiglobal_sums(costs, 0.2, 0.015, sums)
-        return [torch.from_numpy(costs), torch.from_numpy(sums)]
 
-    assert_every_failure_is_an_error(run, at_least=3)
+@pytest.mark.parametrize(
+    ("run", "at_least"),
+    [
+        (partial(loss, weighted=False), 4),
+        (partial(loss, weighted=True), 4),
+        (partial(activation, "exp"), 4),
+        (partial(activation, "logistic"), 4),
+        (adam, 2),
+        (adam_of_harmonics, 0),
+        (statistics, 0),
+        (partial(resample, 20, 30), 3),
+        (partial(resample, 90, 70), 3),
+        (plane_sweep, 3),
+    ],
+)
+def test_other_kernels(run: Callable[[], Results], at_least: int) -> None:
+    assert_every_failure_is_an_error(run, at_least)
 
 
 FEWER_THREADS = """

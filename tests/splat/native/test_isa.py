@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import platform
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -26,3 +29,15 @@ def test_the_instruction_sets_are_those_that_linux_names() -> None:
     flags = set(next(line for line in lines if line.startswith("flags")).split())
     expected = [name for name, needed in NEEDED.items() if needed <= flags]
     assert _native.available_isas() == expected
+
+
+@pytest.mark.parametrize(("value", "says"), [("portable", "portable"), ("sse9", "XRGS_ISA")])
+def test_the_environment_chooses_the_instruction_set(value: str, says: str) -> None:
+    result = subprocess.run(
+        [sys.executable, "-P", "-c", "from xrgs import _native; print(_native.isa())"],
+        env=os.environ | {"XRGS_ISA": value},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert says in (result.stdout if value == "portable" else result.stderr)

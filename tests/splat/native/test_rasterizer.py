@@ -43,6 +43,8 @@ def check(
     """Compare image, alpha, visibility and gradients with the oracle's."""
     raster = raster or RasterSettings()
     ours, gradients, exact, band = compare(single(scene), rounded(camera), raster, **options)
+    off = gradients["shN"][:, (options.get("sh_degree", 3) + 1) ** 2 - 1 :]
+    assert (off == 0).all()
     error = (ours.image.double() - exact.image).abs().detach()
     assert error.mean() <= 1e-6 * max(1.0, float(exact.image.detach().max()))
     assert torch.equal(ours.visible, exact.visible)
@@ -52,14 +54,12 @@ def check(
 # --- against the oracle -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])
-def test_a_scene_of_every_degree(isa: str, sh_degree: int) -> None:
+@pytest.mark.parametrize("sh_degree", [0, 3])
+def test_a_plain_scene(isa: str, sh_degree: int) -> None:
     camera = make_camera(50, 37, turned=True)
     scene = make_scene(300, camera, seed=1)
     ours, gradients, band = check(scene, camera, sh_degree=sh_degree, floor=GRADIENT_FLOOR)
-    on = (sh_degree + 1) ** 2 - 1
-    assert (gradients["shN"][:, on:] == 0).all()
-    assert (gradients["shN"][:, :on] != 0).any() == (sh_degree > 0)
+    assert (gradients["shN"] != 0).any() == (sh_degree > 0)
     assert band.float().mean() < 0.1
     assert ours.image.max() > 0.3
     assert 0 < ours.evaluations < 300 * 50 * 37
@@ -71,7 +71,7 @@ def test_antialiased_before_a_background(isa: str) -> None:
     raster = RasterSettings(antialiased=True, background=(0.2, 0.5, 0.9))
     scene = make_scene(300, camera, seed=2, size=0.7)
     scene["scales"][::5] *= 1e-3  # the compensation leaves little or nothing of these
-    check(scene, camera, raster)
+    check(scene, camera, raster, sh_degree=1)
 
 
 @pytest.mark.parametrize("opacity", [0.02, 0.9, 1.0])
@@ -95,7 +95,7 @@ def test_beyond_the_field_of_view(isa: str) -> None:
     scene = make_scene(200, camera, seed=6, size=12.0)
     inward = scene["means"] - camera.position
     scene["means"] = camera.position + inward * torch.tensor([1.8, 1.9, 1.0], dtype=torch.float64)
-    ours, _, _ = check(scene, camera)
+    ours, _, _ = check(scene, camera, sh_degree=2)
     assert ours.visible.sum() > 20
 
 
@@ -132,24 +132,13 @@ def test_a_near_plane_at_the_camera_or_behind(isa: str, near: float) -> None:
     assert torch.equal(ours.visible[: len(depths)], expected)
 
 
-@pytest.mark.parametrize("stretch", [30.0, 3000.0])
-def test_needles(isa: str, stretch: float) -> None:
+def test_needles(isa: str) -> None:
     camera = make_camera(60, 40, turned=True)
     scene = make_scene(60, camera, seed=7, size=1.0)
-    scene["scales"][:, 0] *= stretch
+    scene["scales"][::2, 0] *= 30
+    scene["scales"][1::2, 0] *= 3000
     scene["scales"][:, 1:] *= 1e-3
     check(scene, camera)
-
-
-def test_quaternions_of_any_length(isa: str) -> None:
-    camera = make_camera()
-    scene = make_scene(50, camera, seed=8)
-    scene["quats"][::5] = 0
-    scene["quats"][1::5] *= 1e-18
-    scene["quats"][2::5] *= 1e18
-    scene["quats"][3::5] *= 3.4e38 / scene["quats"][3::5].abs().amax(1, keepdim=True)
-    _, gradients, _ = check(scene, camera)
-    assert (gradients["quats"][::5] == 0).all()
 
 
 def test_flat_and_huge(isa: str) -> None:
@@ -161,23 +150,6 @@ def test_flat_and_huge(isa: str) -> None:
     check(scene, camera)
 
 
-def test_beyond_the_largest_depth(isa: str) -> None:
-    camera = rounded(make_camera())
-    scene = single(make_scene(50, camera, seed=9))
-    scene["means"][1::8] = torch.tensor([1e37, -1e37, 1.5e38])
-    scene["scales"][1::8] = 1e37
-    scene["opacities"][1::8] = 0.9
-    v_image = torch.ones(camera.height, camera.width, 3)
-    ours, gradients = run(
-        scene, camera, RasterSettings(), "native", torch.float32, (v_image, v_image[..., 0])
-    )
-    assert not ours.visible[1::8].any()
-    assert all((gradients[name][1::8] == 0).all() for name in PARAMETERS)
-    scene["means"][1::8] = torch.tensor([0.0, 0.0, -1.0])
-    without, _ = run(scene, camera, RasterSettings(), "native", torch.float32)
-    assert torch.equal(ours.image, without.image)
-
-
 def test_equal_depths_go_by_index(isa: str) -> None:
     camera = make_camera()
     scene = make_scene(80, camera, seed=10)
@@ -185,18 +157,19 @@ def test_equal_depths_go_by_index(isa: str) -> None:
     check(scene, camera)
 
 
-@pytest.mark.parametrize(("width", "height"), [(1, 1), (1, 33), (33, 1), (16, 16), (17, 15)])
-@pytest.mark.parametrize("count", [1, 15, 16, 17])
+@pytest.mark.parametrize(
+    ("width", "height", "count"),
+    [(1, 1, 17), (1, 33, 16), (33, 1, 15), (16, 16, 1), (17, 15, 17)],
+)
 def test_sizes(isa: str, width: int, height: int, count: int) -> None:
     camera = make_camera(width, height)
     check(make_scene(count, camera, seed=width + count), camera)
 
 
-@pytest.mark.parametrize("antialiased", [False, True])
-def test_absgrad(isa: str, antialiased: bool) -> None:
+def test_absgrad(isa: str) -> None:
     camera = make_camera(50, 37, turned=True)
     scene = make_scene(300, camera, seed=13, size=3.0)
-    raster = RasterSettings(antialiased=antialiased, background=(0.3, 0.6, 0.1))
+    raster = RasterSettings(antialiased=True, background=(0.3, 0.6, 0.1))
     _, plain, _ = check(scene, camera, raster)
     _, absolute, _ = check(scene, camera, replace(raster, absgrad=True))
     for name in PARAMETERS:
@@ -247,8 +220,9 @@ def needle(length: float, width: float, seed: int) -> tuple[Scene, Camera, int]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("antialiased", [False, True])
-@pytest.mark.parametrize(("length", "width"), [(100, 0.3), (1000, 0.05)])
+@pytest.mark.parametrize(
+    ("length", "width", "antialiased"), [(100, 0.3, True), (1000, 0.05, False)]
+)
 def test_gradients_of_needles_are_as_exact_as_float32_in_torch(
     length: float, width: float, antialiased: bool
 ) -> None:

@@ -10,10 +10,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.splat.scenes import Scene, make_camera, make_scene
+from tests.splat.scenes import Scene, draw, gradients_of, make_camera, make_scene, with_gradients
 from xrgs.splat.cameras import Camera
-from xrgs.splat.gaussians import PARAMETERS, ActivatedGaussians
-from xrgs.splat.rendering import Render, rasterize_parameters
+from xrgs.splat.gaussians import ActivatedGaussians
+from xrgs.splat.rendering import Render
 from xrgs.splat.settings import CullingOptions, RasterSettings
 
 pytest.importorskip("xrgs._native")
@@ -25,9 +25,8 @@ def render_with(
     """The render, its gradients, and the work that each kind of culling lessens."""
     from xrgs.splat.native.rasterizer import render_culled
 
-    leaves = {name: scene[name].clone().requires_grad_() for name in PARAMETERS}
-    gaussians = ActivatedGaussians(**leaves)
-    done = render_culled(gaussians, camera, RasterSettings(), 3, None, culling)
+    leaves = with_gradients(scene)
+    done = render_culled(ActivatedGaussians(**leaves), camera, RasterSettings(), 3, None, culling)
     graph: Any = done.image.grad_fn
     frame = graph.frame
     work = {
@@ -38,8 +37,7 @@ def render_with(
         "saturated": done.evaluations,
     }
     torch.autograd.backward(done.image.square().sum())
-    gradients = {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
-    return done, gradients, work
+    return done, gradients_of(leaves), work
 
 
 NAMES = [*(field.name for field in fields(CullingOptions)), "all"]
@@ -71,32 +69,15 @@ def crowd_and_truth(where: str) -> tuple[Scene, Camera, Tensor]:
         K = camera.K.clone()
         K[0, 2] += 4000
         camera = Camera(camera.viewmat, K, 4500, 20)
-    exact = ActivatedGaussians(**{key: value.double() for key, value in scene.items()})
-    render = rasterize_parameters(*exact, camera, RasterSettings(), sh_degree=3, backend="torch")
-    return scene, camera, render.image.detach()
+    exact = draw({key: value.double() for key, value in scene.items()}, camera)
+    return scene, camera, exact.image
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_culling_makes_no_difference(isa: str, name: str) -> None:
-    check_culling("near", name)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", NAMES)
-def test_culling_makes_no_difference_thousands_of_pixels_away(isa: str, name: str) -> None:
-    check_culling("far", name)
-
-
-def test_tile_evaluations_are_those_without_the_culling_inside_tiles() -> None:
-    # The image has whole tiles: pixels beyond its edge are counted and never computed.
-    scene, camera = crowd(make_camera(64, 48, focal=60.0, turned=True), 1500, 3.0)
-    every_pixel, _, _ = render_with(CullingOptions(blocks=False, saturated=False), scene, camera)
-    usual, _, _ = render_with(CullingOptions(), scene, camera)
-    assert usual.tile_evaluations == every_pixel.tile_evaluations == every_pixel.evaluations
-    assert 0 < usual.evaluations < usual.tile_evaluations
-
-
-def check_culling(where: str, name: str) -> None:
+@pytest.mark.parametrize(
+    ("where", "name"),
+    [*(("near", name) for name in NAMES), pytest.param("far", "all", marks=pytest.mark.slow)],
+)
+def test_culling_makes_no_difference(isa: str, where: str, name: str) -> None:
     """Compare renders with and without a kind of culling, or all, with each other and the truth."""
     scene, camera, truth = crowd_and_truth(where)
     names = [field.name for field in fields(CullingOptions)] if name == "all" else [name]
@@ -115,3 +96,12 @@ def check_culling(where: str, name: str) -> None:
     error = (done.image.double() - truth).abs().detach()
     assert error.mean() <= 1e-6
     assert error.max() <= 2e-3
+
+
+def test_tile_evaluations_are_those_without_the_culling_inside_tiles() -> None:
+    # The image has whole tiles: pixels beyond its edge are counted and never computed.
+    scene, camera = crowd(make_camera(64, 48, focal=60.0, turned=True), 1500, 3.0)
+    every_pixel, _, _ = render_with(CullingOptions(blocks=False, saturated=False), scene, camera)
+    usual, _, _ = render_with(CullingOptions(), scene, camera)
+    assert usual.tile_evaluations == every_pixel.tile_evaluations == every_pixel.evaluations
+    assert 0 < usual.evaluations < usual.tile_evaluations

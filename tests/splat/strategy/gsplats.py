@@ -6,10 +6,12 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
+import numpy as np
 import torch
 from gsplat.cuda._torch_impl import _quat_scale_to_covar_preci
 from gsplat.strategy import DefaultStrategy, MCMCStrategy
@@ -23,6 +25,25 @@ from xrgs.splat.settings import DensifySettings, OptimizerSettings
 SCENE_SCALE = 1.7
 SIZES = {"HR": (40, 30), "LR": (8, 6)}
 """LR views are five times smaller; gradients in normalised device units do not depend on it."""
+
+
+def random_values(
+    count: int,
+    rng: np.random.Generator,
+    *,
+    scales: tuple[float, float],
+    opacities: tuple[float, float],
+) -> dict[str, Tensor]:
+    """Raw parameters, the last two uniform between bounds: logarithms of scales, and logits."""
+    values = {
+        "means": rng.normal(size=(count, 3)),
+        "quats": rng.normal(size=(count, 4)),
+        "scales": rng.uniform(*scales, size=(count, 3)),
+        "opacities": rng.uniform(*opacities, size=count),
+        "sh0": rng.normal(size=(count, 1, 3)),
+        "shN": rng.normal(size=(count, 3, 3)),
+    }
+    return {name: torch.from_numpy(value).float() for name, value in values.items()}
 
 
 @dataclass
@@ -112,6 +133,13 @@ class Theirs(Trainer):
             reset_opa(self.params, self.optimizers, self.state, value)
 
 
+@cache
+def _coefficients(shares: int) -> list[float]:
+    """The coefficient of each power of the opacity in the sum over i and k of the kernel."""
+    sums = [sum(math.comb(i - 1, k) for i in range(k + 1, shares + 1)) for k in range(shares)]
+    return [(-1) ** k * each / math.sqrt(k + 1) for k, each in enumerate(sums)]
+
+
 def relocation(opacity: float, shares: int) -> tuple[float, float]:
     """gsplat's kernel of relocation (`cuda/csrc/RelocationCUDA.cu`) in double, which needs a GPU.
 
@@ -119,11 +147,7 @@ def relocation(opacity: float, shares: int) -> tuple[float, float]:
         The opacity of each of the Gaussians, and the factor of their scales.
     """
     shared = 1 - (1 - opacity) ** (1 / shares)
-    terms = (
-        math.comb(i - 1, k) * (-1) ** k / math.sqrt(k + 1) * shared ** (k + 1)
-        for i in range(1, shares + 1)
-        for k in range(i)
-    )
+    terms = (c * shared ** (k + 1) for k, c in enumerate(_coefficients(shares)))
     return shared, opacity / math.fsum(terms)
 
 

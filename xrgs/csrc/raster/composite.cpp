@@ -1,13 +1,5 @@
 // Compositing, forward: blends a tile's list of Gaussians front to back into sixteen blocks of 4x4
-// pixels.
-//
-// Alpha is capped at alpha_max and skipped below alpha_min (Eq. 8). alpha T color is added to the
-// colour of a pixel, and its transmittance T becomes T (1 - alpha) (Eq. 14). If the new
-// transmittance is transmittance_min or less, the Gaussian is not composited and the pixel is
-// saturated. T is still multiplied after that: it never rises, so later Gaussians are not
-// composited either, and the composited ones are a prefix of the list.
-//
-// With the culling options off, every block processes the whole list of its tile.
+// pixels (Eq. 8 and 14). With the culling options off, every block processes the whole list.
 #include "raster/cutoff_ellipse.h"
 #include "raster/stages.h"
 #include "raster/tile_batch.h"

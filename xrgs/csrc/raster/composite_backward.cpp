@@ -1,13 +1,5 @@
 // Compositing, backward: from the gradient of the image to pair_grads, one row for each (tile,
-// Gaussian) pair.
-//
-// With v_image the gradient of a pixel's colour and v_alpha that of its alpha, each Gaussian i of
-// the pixel's list has (Eq. 16 and 17)
-//   G_i = (color_i - background) . v_image + v_alpha,    w_i = alpha_i T_i,
-//   dL/d(ln alpha_i) = w_i (G_i - R_i),    R_{i-1} = R_i + alpha_i (G_i - R_i),
-// where R_i is the sum of w_j G_j over all Gaussians j behind Gaussian i, divided by the
-// transmittance behind i. Computed back to front, R needs no division by 1 - alpha, and no digits
-// are lost to cancellation.
+// Gaussian) pair (Eq. 16 to 18, whose names are used here).
 //
 // The batches of a tile are processed from the last to the first. For each block, a pass front to
 // back repeats the forward pass, from the transmittance that the forward pass saved, and stores

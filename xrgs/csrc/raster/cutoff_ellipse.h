@@ -1,11 +1,9 @@
 // The horizontal extent of a Gaussian's cutoff ellipse within a strip of pixel rows.
 //
-// Outside the cutoff ellipse u^2 + v^2 <= cutoff_radius_sq, alpha is below alpha_min (Eq. 11). At
-// height dy the ellipse extends between dx = (chol_xy dy +- sqrt(cutoff_radius_sq - v^2)) / chol_xx
-// (Eq. 13). It is convex, so its rightmost point within a strip of rows is at dy = dy_at_xmax, as
-// that of the whole ellipse, or at the row of the strip nearest to it. The leftmost point is found
-// in the same way at -dy_at_xmax. The part within the strip is convex too, so it overlaps every
-// column of pixels between the two points.
+// The ellipse (Eq. 11 and 13) is convex, so its rightmost point within a strip of rows is at dy =
+// dy_at_xmax, as that of the whole ellipse, or at the row of the strip nearest to it. The leftmost
+// point is found in the same way at -dy_at_xmax. The part within the strip is convex too, so it
+// overlaps every column of pixels between the two points.
 #pragma once
 
 #include "raster/types.h"

@@ -1,8 +1,5 @@
-// The projection stage: from parameters to projected Gaussians, sixteen at a time.
-//
-// A Gaussian is visible if it is in front of the near plane, its opacity is at least alpha_min, and
-// the bounding box of its cutoff ellipse overlaps the image. With the culling options off,
-// Gaussians that fail one of the last two conditions are projected too.
+// The projection stage: from parameters to projected Gaussians, sixteen at a time. With the culling
+// options off, those of a low opacity, and those outside the image, are projected too.
 #include <cstring>
 
 #include "raster/sh.h"

@@ -1,9 +1,6 @@
 // Real spherical harmonics of degree 0 to 3 and their derivatives, for sixteen directions at a
-// time.
-//
-// The basis is that of 3D Gaussian Splatting and gsplat: orthonormal, with the Condon-Shortley
-// phase, in the order l^2 + l + m. Derivatives are those of the polynomials as written, with x, y
-// and z as independent variables; the normalisation of the direction is a separate step (Eq. 32).
+// time. xrgs/splat/sh.py describes the basis. Derivatives are those of the polynomials as written,
+// with x, y and z as independent variables; the direction is normalised separately (Eq. 32).
 #pragma once
 
 #include <cstdint>

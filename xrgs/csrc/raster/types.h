@@ -128,9 +128,7 @@ struct TileIntersection {
 // The columns of pair_grads [pairs, kPairGradStride]: sums over the pixels of a pair. With
 // g = dL/d(ln alpha), w = alpha T, and u and dy as in Eq. 8, they are
 //   g, g u, g dy, g u^2, g u dy, g dy^2, and w v_image for each colour (Eq. 18);
-// with absgrad also |dL/d(mean2d)| for x and y (Eq. 21), else zeros. Powers of u are used instead
-// of dx, because for a long thin Gaussian the sum of g u^2 would be a small difference of the sums
-// of g dx^2, g dx dy and g dy^2.
+// with absgrad also |dL/d(mean2d)| for x and y (Eq. 21), else zeros.
 enum PairGradField {
   kGrad,
   kGradU,

@@ -68,21 +68,9 @@ def render(
 ) -> Render:
     """Render Gaussians into one view as `xrgs.splat.rendering.rasterize_parameters` does.
 
-    Args:
-        gaussians: N Gaussians, float32 on the GPU, whose shapes have been checked. Values may be
-            infinite or NaN.
-        camera: The view.
-        settings: How Gaussians become pixels.
-        sh_degree: Highest band of the spherical harmonics that is on.
-        means2d_offset: [N, 2] made by `zero_means2d_offset`, whose `grad` becomes the image-plane
-            gradient; None if that is not needed.
-        raw: Whether scales and opacities are natural logarithms and logits.
-
-    Returns:
-        The render, once differentiable in every parameter; `backward` sets the offset's `grad`. A
-        Gaussian is `visible` if its radii in px, rounded up, reach the image. `evaluations` counts
-        all pixels of a tile, also saturated ones. `buffer_bytes` is 0: on a GPU, `TrainingMemory`
-        counts all that torch allocates, gsplat's buffers included.
+    Values may be infinite or NaN. A Gaussian is `visible` if its radii in px, rounded up, reach the
+    image. `evaluations` counts all pixels of a tile, also saturated ones. `buffer_bytes` is 0: on a
+    GPU, `TrainingMemory` counts all that torch allocates, gsplat's buffers included.
 
     Raises:
         ValueError: The offset is not made by `zero_means2d_offset`: gsplat can't add an offset.

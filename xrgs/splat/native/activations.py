@@ -21,13 +21,7 @@ def exp(x: Tensor) -> Tensor:
     """Return e^x: scales from their natural logarithms.
 
     The relative error is below 1.0e-7. A result below 2^-126 is 0, a result above the largest
-    float is infinite, and NaN stays NaN.
-
-    Args:
-        x: A float32 tensor of any shape, on the CPU.
-
-    Returns:
-        A tensor of the same shape, contiguous, once differentiable.
+    float is infinite, and NaN stays NaN. The result is contiguous, and once differentiable.
 
     Raises:
         ValueError: `x` is not float32 on the CPU.
@@ -38,26 +32,13 @@ def exp(x: Tensor) -> Tensor:
 def logistic(x: Tensor) -> Tensor:
     """Return 1 / (1 + e^-x): opacities from their logits.
 
-    The relative error is below 2.0e-7. A result below 2^-126 is 0, and NaN stays NaN.
-
-    Args:
-        x: A float32 tensor of any shape, on the CPU.
-
-    Returns:
-        A tensor of the same shape, contiguous, once differentiable.
-
-    Raises:
-        ValueError: `x` is not float32 on the CPU.
+    The relative error is below 2.0e-7. Otherwise as `exp`.
     """
     return _activate(x, _native.logistic, _native.logistic_backward)
 
 
 def activate(scales: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor]:
-    """Return `exp(scales)` and `logistic(opacities)`, in one node of the graph.
-
-    Raises:
-        ValueError: A tensor is not float32 on the CPU.
-    """
+    """Return `exp(scales)` and `logistic(opacities)`, in one node of the graph."""
     require_float32("scales", scales)
     require_float32("opacities", opacities)
     activated: tuple[Tensor, Tensor] = _ScalesAndOpacities.apply(scales, opacities)

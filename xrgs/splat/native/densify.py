@@ -19,8 +19,7 @@ def accumulate_statistics(
     """Add a step's image-plane gradients as `xrgs.splat.torch.densify.accumulate_statistics` does.
 
     Raises:
-        ValueError: A tensor has the wrong type or shape (floats must be float32), or
-            `grad2d_sum` or `visible_count` is not contiguous.
+        ValueError: A tensor has the wrong type, shape or strides.
     """
     require_float32("means2d_grad", means2d_grad)
     if visible.dtype != torch.bool:

@@ -18,15 +18,6 @@ def target_moments(image: Tensor) -> tuple[Tensor, Tensor]:
     """Compute `xrgs.splat.torch.loss.target_moments`, with the same bits for any thread count.
 
     Moments below 1.2e-38 are zero.
-
-    Args:
-        image: [H, W, 3], float32 on the CPU, contiguous.
-
-    Returns:
-        Mean and variance, [H - 10, W - 10, 3] each.
-
-    Raises:
-        ValueError: `image` is not float32 on the CPU.
     """
     require_float32("image", image)
     moments: tuple[Tensor, Tensor] = _native.window_moments(
@@ -43,10 +34,6 @@ def photometric_loss(
     Sums are in double and in a fixed order: value and gradient have the same bits for any number of
     threads. A NaN in the image, the target or the weights makes the loss NaN, and the gradients of
     all pixels that share a window with it. Tensors may have any strides.
-
-    Raises:
-        ValueError: `image`, `target` or `pixel_weight` is not float32 on the CPU, or `pixel_weight`
-            requires a gradient.
     """
     require_float32("image", image)
     require_float32("target", target.image)

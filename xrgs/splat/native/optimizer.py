@@ -23,9 +23,6 @@ def step(optimizer: SplatOptimizer, camera: Camera | None = None, sh_degree: int
     (`tests/splat/native/test_optimizer.py` has the bounds). A value whose gradient and moments are
     zero, as of harmonics that are not on yet, is not written. The result has the same bits for any
     number of threads. With a camera, the gradient of shN is never written to memory.
-
-    Raises:
-        ValueError: A parameter, gradient or moment is not float32 on the CPU and contiguous.
     """
     harmonics: tuple[Any, ...] | None = None
     moved: list[Tensor] = []

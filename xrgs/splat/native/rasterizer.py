@@ -44,27 +44,15 @@ def render(
     """Render Gaussians into one view as `xrgs.splat.rendering.rasterize_parameters` does.
 
     The number of threads is torch's (`torch.set_num_threads`). The result has the same bits for any
-    number of threads.
+    number of threads. With `raw`, image and gradients have the bits of `activate` and then
+    `render`, and one pass over memory is saved forward and one backward.
 
-    Args:
-        gaussians: N Gaussians, float32, whose shapes have been checked.
-        camera: The view.
-        settings: How Gaussians become pixels.
-        sh_degree: Highest band of the spherical harmonics that is on.
-        means2d_offset: [N, 2] px, added to the projected means; None for zeros.
-        raw: Whether scales and opacities are natural logarithms and logits. The kernels then
-            activate them while reading: image and gradients have the bits of `activate` and then
-            `render`, and one pass over memory is saved forward and one backward.
-
-    Returns:
-        The render, once differentiable in every parameter and the offset. Its backward pass raises
-        ValueError if a needed gradient is not finite. The message names the parameter, or the
-        incoming gradient `v_image` or `v_alpha` if that one is not finite.
+    The backward pass raises ValueError if a needed gradient is not finite. The message names the
+    parameter, or the incoming gradient `v_image` or `v_alpha` if that one is not finite.
 
     Raises:
-        ValueError: A parameter is not float32 on the CPU, or has values that are not finite or out
-            of range; or float32 cannot hold a number of the camera or the settings. Harmonics are
-            only checked for visible Gaussians.
+        ValueError: As for `rasterize_parameters`, or float32 cannot hold a number of the camera or
+            the settings. Harmonics are only checked for visible Gaussians.
         MemoryError: The tile lists of the view do not fit in memory.
     """
     return render_culled(
@@ -109,11 +97,7 @@ def render_config(
     *,
     raw: bool = False,
 ) -> _native.RenderConfig:
-    """Convert camera and settings to the config of `_native.Frame.forward`.
-
-    Raises:
-        ValueError: float32 cannot hold a number of the camera or the settings.
-    """
+    """Convert camera and settings to the config of `_native.Frame.forward`."""
     return _native.RenderConfig(
         viewmat=camera.numbers.viewmat,
         intrinsics=camera.numbers.intrinsics,

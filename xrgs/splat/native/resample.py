@@ -27,9 +27,6 @@ def resize(image: Tensor, height: int, width: int, variances: Tensor | None = No
 
     The backward pass multiplies by the exact transpose. Image and gradient have the same bits for
     any number of threads. An infinite or NaN pixel affects only the samples within its filter.
-
-    Raises:
-        ValueError: `image` is not float32 on the CPU.
     """
     require_float32("image", image)
     resized: Tensor
@@ -42,16 +39,7 @@ def resize(image: Tensor, height: int, width: int, variances: Tensor | None = No
 
 @cache
 def banded_matrix(old: int, new: int, *, transposed: bool = False) -> BandedMatrix:
-    """Return `bicubic_matrix(old, new)`, or its transpose, without its zeros.
-
-    Args:
-        old: Number of samples along the axis before resampling.
-        new: Number of samples after resampling.
-        transposed: Whether to return the transpose, for the backward pass.
-
-    Returns:
-        The matrix [new, old], or [old, new] if transposed.
-    """
+    """Return `bicubic_matrix(old, new)` [new, old], or its transpose, without its zeros."""
     dense = bicubic_matrix(old, new).T if transposed else bicubic_matrix(old, new)
     nonzero = dense != 0
     column = torch.arange(dense.shape[1])
@@ -71,13 +59,7 @@ class _BlurredAxis:
     """
 
     def __init__(self, old: int, new: int, variance: float) -> None:
-        """Compute the kernel and the matrix.
-
-        Args:
-            old: Number of samples along the axis before resampling.
-            new: Number of samples after resampling.
-            variance: Variance of the blur, px^2 before resampling.
-        """
+        """Compute the kernel and the matrix, for a variance in px^2 before resampling."""
         self.old, self.new = old, new
         # exp(-t) I_n(t) at n px, for the variance t. Beyond five standard deviations it is below
         # float32's precision; 4 px more are for the longer tails of a variance far below 1.

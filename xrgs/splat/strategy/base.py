@@ -22,15 +22,8 @@ NO_HOOKS = StrategyHooks()
 class Strategy(ABC):
     """Adds, removes and changes Gaussians between steps: gsplat's `Strategy` (`strategy/base.py`).
 
-    A strategy is responsible for
-
-    - the statistics of the steps since the last refinement,
-    - the growth of Gaussians,
-    - pruning, opacity resets and other changes outside the optimizer's steps,
-    - the part of a checkpoint for all of these.
-
-    It adds and removes Gaussians only through the optimizer, so that Adam's moments follow. The
-    example of `DefaultStrategy` is the training loop around it.
+    It changes Gaussians only through the optimizer, so that Adam's moments follow. The example of
+    `DefaultStrategy` is the training loop around it.
 
     Attributes:
         asks_components: Whether training components influence growth: by `groups`,
@@ -109,14 +102,7 @@ class Strategy(ABC):
 
     @abstractmethod
     def remove(self, mask: Tensor) -> int:
-        """Remove Gaussians with their moments and statistics, at any step.
-
-        Args:
-            mask: [N] bool, the Gaussians to remove.
-
-        Returns:
-            The number of removed Gaussians.
-        """
+        """Remove the Gaussians of `mask` [N] with moments and statistics; return their number."""
 
     @abstractmethod
     def state_dict(self) -> dict[str, Any]:

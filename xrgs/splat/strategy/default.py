@@ -271,12 +271,7 @@ class DefaultStrategy(Strategy):
     def _prune(
         self, thresholds: Tensor, deciding_row: Tensor, *, prune_large: bool
     ) -> tuple[dict[str, int], list[int]]:
-        """Remove Gaussians whose opacity is too low or whose scale is too large.
-
-        Args:
-            thresholds: [G] opacities.
-            deciding_row: [N] row of the opacity threshold for each Gaussian.
-            prune_large: Whether to remove Gaussians for their scale.
+        """Remove Gaussians of an opacity below `thresholds[deciding_row]`, or that are too large.
 
         Returns:
             The counts, and the number of Gaussians that each of the G thresholds removed.

@@ -50,28 +50,16 @@ class Budget:
 
 
 def gaussians_of(budget: float, view_pixels: int) -> int:
-    """Convert a budget per pixel to a number of Gaussians, at least 1.
-
-    Args:
-        budget: Gaussians per pixel.
-        view_pixels: Number of pixels of the largest training view.
-    """
+    """Convert a budget per pixel of the largest view to a number of Gaussians, at least 1."""
     return max(1, round(budget * view_pixels))
 
 
 def top_k(candidates: Tensor, scores: Tensor, count: int) -> Tensor:
-    """Choose the candidates with the highest scores; ties go to the lower indices.
+    """Choose `count` candidates with the highest scores; ties go to the lower indices.
 
     ImprovedGS [deng2025] draws candidates with probabilities in proportion to their scores. Our
-    choice: the highest scores, which needs no random numbers.
-
-    Args:
-        candidates: [N] bool.
-        scores: [N] floats; a score that is infinite or NaN counts as 0.
-        count: Number to choose, at least 0; all candidates if there are fewer.
-
-    Returns:
-        [N] bool, the chosen candidates.
+    choice: the highest scores, which needs no random numbers. Candidates and the result are
+    [N] bool; scores [N] that are infinite or NaN count as 0.
     """
     index = candidates.nonzero()[:, 0]  # [M]
     ranked = torch.nan_to_num(scores[index], nan=0.0, posinf=0.0, neginf=0.0)
@@ -86,10 +74,7 @@ def split_at_random(
 ) -> dict[str, Tensor]:
     """Split each Gaussian into two smaller ones with means drawn from it (gsplat's `split`).
 
-    Args:
-        old: Raw parameters [M, ...] for each name of `PARAMETERS`.
-        scales: [M, 3] world units.
-        generator: Draws the means.
+    `old` are raw parameters [M, ...] by name, `scales` [M, 3] are in world units.
 
     Returns:
         Raw parameters [2 M, ...]: the first half of every Gaussian, then the second.
@@ -114,12 +99,8 @@ def split_along_longest_axis(old: Mapping[str, Tensor], scales: Tensor) -> dict[
     Rotation and colour are kept. ImprovedGS's own code has an offset of 1.35 s_k and factors of
     0.55 and 0.89 for the scales. Among equal scales the first counts as the longest.
 
-    Args:
-        old: Raw parameters [M, ...] for each name of `PARAMETERS`.
-        scales: [M, 3] world units.
-
-    Returns:
-        Raw parameters [2 M, ...]: all halves on the positive side of the axis, then the others.
+    The arguments are those of `split_at_random`. In the result [2 M, ...] all halves on the
+    positive side of the axis come first.
     """
     longest = old["scales"].argmax(dim=-1, keepdim=True)  # [M, 1]
     axis = longest[:, None].expand(-1, 3, -1)  # [M, 3, 1]

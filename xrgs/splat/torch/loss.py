@@ -13,14 +13,7 @@ _ROWS = 32
 
 
 def target_moments(image: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the mean and the variance of a photograph in each SSIM window (`Target`).
-
-    Args:
-        image: [H, W, 3], of any floating type, contiguous, detached from autograd.
-
-    Returns:
-        Mean and variance, [H - 10, W - 10, 3] each, of the image's type.
-    """
+    """Return the mean and the variance of a photograph [H, W, 3] in each SSIM window (`Target`)."""
     height, width = image.shape[:2]
     mean, variance = (image.new_empty(height - WINDOW + 1, width - WINDOW + 1, 3) for _ in range(2))
     for row in range(0, len(mean), _ROWS):
@@ -57,10 +50,6 @@ def dissimilarity_map(image: Tensor, target: Target) -> Tensor:
         1 - luminance = E[d]^2 / (mean_x^2 + mean_t^2 + C1)
         1 - structure = var_d / (var_x + var_t + C2), where var_x = var_t + 2 cov(t, d) + var_d
         1 - SSIM = (1 - structure) luminance + (1 - luminance)
-
-    Args:
-        image: [H, W, 3] render, of any floating type.
-        target: The photograph, of the same shape and type.
 
     Returns:
         [H - 10, W - 10, 3], one value for each window, in 0..2 up to rounding.

@@ -18,14 +18,7 @@ if TYPE_CHECKING:
 
 @torch.no_grad()
 def step(optimizer: SplatOptimizer, camera: Camera | None = None, sh_degree: int = 0) -> None:
-    """Update every parameter that has a gradient, and Adam's state of it (`SplatOptimizer.step`).
-
-    Args:
-        optimizer: The parameters with their gradients and Adam states.
-        camera: The rendered view that the gradients come from. None leaves shN as it is, unless shN
-            has a gradient.
-        sh_degree: Highest rendered band of the spherical harmonics.
-    """
+    """Update every parameter that has a gradient (`SplatOptimizer.step`)."""
     if camera is not None:
         _fill_harmonics_gradient(optimizer, camera, sh_degree)
     for name in PARAMETERS:

@@ -35,15 +35,7 @@ class ProjectedGaussians(NamedTuple):
 
 
 def depths(means: Tensor, camera: Camera) -> Tensor:
-    """Return the depths of Gaussians: their distances along the camera's optical axis.
-
-    Args:
-        means: [N, 3] world units.
-        camera: The view.
-
-    Returns:
-        [N] world units, negative behind the camera.
-    """
+    """Return the depths [N] of means [N, 3] along the optical axis, negative behind the camera."""
     forward = camera.viewmat[2].to(means)  # [4]
     return means @ forward[:3] + forward[3]
 
@@ -63,16 +55,7 @@ def project(
     sqrt(det(M M^T) / det(M M^T + eps2d I)), the 2D Mip filter of Mip-Splatting [yu2024] as in
     gsplat (`calc_compensations`).
 
-    Args:
-        means: [M, 3] world units, all in front of the near plane.
-        quats: [M, 4] wxyz, any length.
-        scales: [M, 3] world units.
-        opacities: [M] in 0..1.
-        camera: The view.
-        settings: `eps2d` and `antialiased` are read.
-
-    Returns:
-        The M Gaussians on the image plane, differentiable.
+    The parameters are those of `rasterize_parameters`, of M Gaussians in front of the near plane.
     """
     viewmat, K = camera.viewmat.to(means), camera.K.to(means)
     x, y, z = (means @ viewmat[:3, :3].T + viewmat[:3, 3]).unbind(-1)  # [M] each
@@ -119,14 +102,8 @@ def _clamp_tangent(tangent: Tensor, before: Tensor, after: Tensor) -> Tensor:
 def cutoff_radius_sq(opacities: Tensor, settings: RasterSettings) -> Tensor:
     """Return the squared radius, in standard deviations, at which alpha falls to alpha_min.
 
-    The radius r solves opacity exp(-r^2 / 2) = alpha_min.
-
-    Args:
-        opacities: [M] in 0..1.
-        settings: `alpha_min` is read.
-
-    Returns:
-        [M] float64, negative if the opacity is below alpha_min.
+    The radius r solves opacity exp(-r^2 / 2) = alpha_min. The result [M] is float64, and negative
+    if the opacity is below alpha_min.
     """
     # For an alpha_min of 0 the radius ends at the smallest normal float64.
     smallest = max(settings.alpha_min, torch.finfo(torch.float64).tiny)
@@ -137,11 +114,6 @@ def visible_by_depth(
     projected: ProjectedGaussians, camera: Camera, settings: RasterSettings
 ) -> Tensor:
     """Return the Gaussians whose bounding box at the cutoff radius overlaps the image.
-
-    Args:
-        projected: N Gaussians in front of the camera.
-        camera: The view.
-        settings: `alpha_min` is read.
 
     Returns:
         [M] indices, front to back; equal depths in ascending order.
@@ -168,9 +140,6 @@ def conic_cholesky(projected: ProjectedGaussians) -> Tensor:
 
     The factor [[c_xx, c_xy], [0, c_yy]] makes the exponent a sum of squares. For d, a pixel's
     centre minus the mean, u = c_xx dx + c_xy dy and v = c_yy dy: alpha = opacity exp(-u^2 - v^2).
-
-    Args:
-        projected: M Gaussians with invertible covariances.
 
     Returns:
         [M, 3] c_xx, c_xy, c_yy in 1/px, differentiable.

@@ -52,20 +52,7 @@ def render(
 ) -> Render:
     """Render Gaussians into one view as `xrgs.splat.rendering.rasterize_parameters` does.
 
-    Args:
-        gaussians: N Gaussians of one floating type, whose shapes have been checked.
-        camera: The view.
-        settings: How Gaussians become pixels.
-        sh_degree: Highest band of the spherical harmonics that is on.
-        means2d_offset: [N, 2] px, added to the projected means; None for zeros.
-        raw: Whether scales and opacities are natural logarithms and logits.
-
-    Returns:
-        The render, differentiable in every parameter and the offset.
-
-    Raises:
-        ValueError: A parameter has values that are not finite or out of range.
-        MemoryError: The (tile, Gaussian) pairs do not fit in memory.
+    Shapes and types have been checked.
     """
     if raw:
         gaussians = activated(gaussians)
@@ -181,12 +168,7 @@ def _composite_batches(
 
 
 def alpha_bytes(itemsize: int, *, absgrad: bool = False) -> int:
-    """Return the bytes that `composite` saves for backward per pair of a pixel and a Gaussian.
-
-    Args:
-        itemsize: Size of a number of the floating type, bytes.
-        absgrad: Whether `RasterSettings.absgrad` is on.
-    """
+    """Return the bytes that `composite` saves for backward per pair of a pixel and a Gaussian."""
     # u, exponential, alpha, 1 - alpha, transmittance before and behind, weights, and two masks;
     # with absgrad also v and the two coordinates of the offset.
     return (10 if absgrad else 7) * itemsize + 2
@@ -212,17 +194,14 @@ class _PixelOffset(torch.autograd.Function):
 def composite(entries: Tensor, corner: Tensor, tile: int, settings: RasterSettings) -> Tensor:
     """Composite tiles front to back (3D Gaussian Splatting, section 4, equation 3).
 
-    An alpha below alpha_min is skipped, an alpha above alpha_max is capped (without gradient), and
-    a pixel ends before the Gaussian that would reduce its transmittance to transmittance_min or
-    less.
+    `RasterSettings` tells what its limits of alpha and transmittance do.
 
     Args:
-        entries: [B, K, 9] attributes of each tile's Gaussians, front to back: x, y, the Cholesky
-            factor of the conic, log opacity, colour; with absgrad [B, K, 11], since an offset of
-            value zero comes last.
+        entries: [B, K, 9] or [B, K, 11] attributes of `_project_visible` of each tile's Gaussians,
+            front to back.
         corner: [B, 2] top left corner of each tile, px.
         tile: Side of a tile, px.
-        settings: The three limits above and `absgrad` are read.
+        settings: How Gaussians become pixels.
 
     Returns:
         [B, tile^2, 4] colour without background, and alpha.

@@ -43,13 +43,7 @@ class TileGrid:
     def span(self, first: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
         """Convert ranges of pixels to ranges of tile columns (or rows).
 
-        Args:
-            first: [R] first pixel of each range.
-            last: [R] last pixel of each range; below `first` if the range is empty.
-
-        Returns:
-            First and last column (or row), [R] each; the last is below the first if the range is
-            empty.
+        First and last, [R] each, are in the range; the last is below the first if it is empty.
         """
         begin = torch.div(first, self.tile, rounding_mode="floor")
         end = torch.div(last, self.tile, rounding_mode="floor")
@@ -74,12 +68,7 @@ def intersect_tiles(
     """List the (tile, Gaussian) pairs in which the alpha of a pixel reaches alpha_min.
 
     A few more pairs are listed, because of `RADIUS_MARGIN`. The ellipse's horizontal extent is
-    computed for each row of tiles.
-
-    Args:
-        projected: Visible Gaussians, front to back.
-        grid: The tiles of the image.
-        settings: `alpha_min` is read.
+    computed for each row of tiles. The Gaussians are the visible ones, front to back.
 
     Returns:
         tile: [P] ascending, numbered row by row.
