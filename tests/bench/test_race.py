@@ -41,7 +41,7 @@ def made(race: Any, **values: Any) -> Any:
     return replace(run, **values)
 
 
-@pytest.mark.parametrize("power", [0.8, 1.0, 1.4])
+@pytest.mark.parametrize("power", [0.8, 1.4])
 def test_a_run_is_planned_to_fit_each_budget(race: Any, power: float) -> None:
     runs: list[Any] = []
     for minutes in (1.0, 3.0, 10.0):
@@ -61,9 +61,6 @@ def test_after_some_tries_the_longest_run_within_a_budget_has_to_do(race: Any) -
         runs.append(made(race, steps=steps, seconds=next(seconds)))
     assert [run.seconds for run in runs] == [5.0, 70.0, 40.0, 61.0]
     assert race.race_table.chosen(runs, 500, 1.0)["plus", "fern"].seconds == 40.0
-
-
-def test_a_budget_below_one_step_is_refused(race: Any) -> None:
     with pytest.raises(SystemExit, match=r"fern / plus: 0\.01 min are less than a step takes"):
         race.plan([made(race, steps=1, seconds=2.0)], 0.01)
 

@@ -174,9 +174,7 @@ def test_bash_completes_a_command(call_command: RunCommand, tmp_path: Path) -> N
         assert done.stdout.decode().split() == [wanted]
 
 
-@pytest.mark.parametrize(
-    "words", ["status --store=~/s", "store list store=~/s"]
-)
+@pytest.mark.parametrize("words", ["status --store=~/s", "store list store=~/s"])
 def test_the_home_folder_of_every_option_is_expanded(
     call_command: RunCommand, monkeypatch: pytest.MonkeyPatch, words: str
 ) -> None:

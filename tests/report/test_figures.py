@@ -37,23 +37,13 @@ def test_the_window_lies_where_the_images_differ() -> None:
     other = PICTURE.copy()
     other[25:33, 36:48] = 1 - other[25:33, 36:48]
     assert differing_crop(PICTURE, other) == (slice(25, 33), slice(36, 48))
-
-
-@pytest.mark.parametrize("corner", [(0, 0), (32, 48)])
-def test_the_window_reaches_the_corners(corner: tuple[int, int]) -> None:
+    rows, columns = slice(0, 8), slice(48, 60)
     other = PICTURE.copy()
-    rows, columns = (slice(at, at + size) for at, size in zip(corner, (8, 12), strict=True))
     other[rows, columns] += 1
-    assert differing_crop(PICTURE, other) == (rows, columns)
-
-
-def test_the_window_of_equal_images_is_the_first() -> None:
-    assert differing_crop(PICTURE, PICTURE) == (slice(0, 8), slice(0, 12))
-
-
-def test_the_window_of_a_tiny_image_is_a_pixel() -> None:
+    assert differing_crop(PICTURE, other) == (rows, columns), "it reaches the corners"
+    assert differing_crop(PICTURE, PICTURE) == (slice(0, 8), slice(0, 12)), "the first"
     tiny = PICTURE[:3, :4]
-    assert differing_crop(tiny, tiny) == (slice(0, 1), slice(0, 1))
+    assert differing_crop(tiny, tiny) == (slice(0, 1), slice(0, 1)), "a pixel"
 
 
 def test_the_same_images_give_the_same_bytes_in_any_style() -> None:
@@ -96,8 +86,7 @@ def traded(name: str, gaussians: list[float], quality: list[float]) -> tuple[pd.
     return means, scenes.assign(scene=["fern", "horns"] * 2)
 
 
-@pytest.mark.parametrize("higher_is_better", [True, False])
-@pytest.mark.parametrize("better", [True, False])
+@pytest.mark.parametrize(("higher_is_better", "better"), [(True, True), (False, False)])
 def test_a_trade_off_has_the_better_up_and_the_smaller_left(
     higher_is_better: bool, better: bool
 ) -> None:
@@ -131,8 +120,7 @@ def changes_over(values: list[float], changes: list[float], series: str = "") ->
     return pd.concat(rows.assign(level=level, scene=scene) for level, scene in levels)
 
 
-@pytest.mark.parametrize("higher_is_better", [True, False])
-@pytest.mark.parametrize("better", [True, False])
+@pytest.mark.parametrize(("higher_is_better", "better"), [(True, True), (False, False)])
 def test_a_better_change_over_a_setting_is_above_the_line_of_the_base(
     higher_is_better: bool, better: bool
 ) -> None:

@@ -110,14 +110,6 @@ def test_a_sweep_that_runs_is_reported_with_what_is_done(made: Any) -> None:
         assert reason in report.text
 
 
-def test_a_report_in_which_nothing_is_done_yet_says_so(made: Any) -> None:
-    for label in ("baseline", "plus"):
-        made.add(label)
-        remove_cell(made.store.cell(made.rows[-1]["cell_id"]))
-    report = build(made.store.path, made.write(), pictures=[])
-    assert "2 of 2 cells are not done yet" in report.text
-
-
 def test_a_picture_of_a_trimmed_cell_says_that_its_images_were_removed(made: Any) -> None:
     made.add(pictures=True)
     cell = made.add("plus", pictures=True)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import cache
 from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
@@ -135,11 +136,6 @@ def read_cells(
 ) -> Sweep:
     """Read every cell of the rows of sweeps' records.
 
-    Args:
-        store: The store that has the cells.
-        commands: The id of each sweep -> the arguments of `xrgs-sweep`.
-        rows: The rows.
-
     Raises:
         ReportError: A row contradicts its cell's identity.
     """
@@ -261,7 +257,7 @@ def _curve(
 def _done_columns(cell_id: str, cell: DoneCell) -> dict[str, Any]:
     """Return the columns of `Sweep.cells` for a done cell, without its scores."""
     figures = msgspec.structs.asdict(cell.summary)
-    train, scored_by = cell.identity.train, without_refactorings(cell.status.scored_by)
+    train, (scored_by, stale) = cell.identity.train, _scored(*cell.status.scored_by.items())
     variant = cell.config.variant if cell.config else None
     return {
         **{metric.name: figures[metric.name] for metric in METRICS if metric.name in figures},
@@ -269,13 +265,20 @@ def _done_columns(cell_id: str, cell: DoneCell) -> dict[str, Any]:
         "state": "done",
         "reason": "",
         "protocol": scored_by.get(PROTOCOL, ""),
-        "stale": " ".join(stale_scores(scored_by)),
+        "stale": stale,
         "validation": train.get("validation", 0.0),
         "steps": cell.summary.steps,
         "long_side": variant.long_side if variant else None,
         "factor": variant.factor if variant else None,
         "machine": _machine(cell_id, cell.provenance),
     }
+
+
+@cache
+def _scored(*digests: tuple[str, str]) -> tuple[dict[str, str], str]:
+    """Return the digests of scores without refactorings, and the names of the stale scores."""
+    scored_by = without_refactorings(dict(digests))
+    return scored_by, " ".join(stale_scores(scored_by))
 
 
 def _machine(cell_id: str, made: Provenance) -> str:
@@ -290,14 +293,11 @@ def _machine(cell_id: str, made: Provenance) -> str:
 
 def _views(done: Mapping[str, DoneCell]) -> pd.DataFrame:
     """Return `Sweep.views`; it has a column even for scores that no cell has."""
-    rows = [
-        {"cell_id": cell_id, "view": view} | scores
-        for cell_id, cell in done.items()
-        for view, scores in cell.scores
-    ]
-    views = pd.DataFrame(rows, columns=["cell_id", "view", *_SCORES])
-    texts: dict[str, Any] = {"cell_id": object, "view": object}
-    return views.astype(texts | dict.fromkeys(_SCORES, np.float64))
+    rows = [(cell_id, view, of) for cell_id, cell in done.items() for view, of in cell.scores]
+    texts = {name: [row[at] for row in rows] for at, name in enumerate(("cell_id", "view"))}
+    scores = {name: [of.get(name, math.nan) for _, _, of in rows] for name in _SCORES}
+    columns = {name: pd.Series(values, dtype=object) for name, values in texts.items()}
+    return pd.DataFrame(columns | {name: np.asarray(of, np.float64) for name, of in scores.items()})
 
 
 def _cells(

@@ -198,12 +198,7 @@ def _cautions(
 
 
 def _cautions_of_photographs(rows: pd.DataFrame, sweep: Sweep) -> list[str]:
-    """Return sentences on test views that have no score, and on mixtures without an LR view.
-
-    Args:
-        rows: The rows of finished cells in `Sweep.cells`.
-        sweep: The sweep.
-    """
+    """Return sentences on test views that have no score, and on mixtures without an LR view."""
     texts = []
     for scene, scene_rows in rows.groupby("scene", sort=False):
         unscored: dict[str, None] = {}
@@ -246,10 +241,6 @@ def decided_by_one_view(
 
     A scene has few test views, and PSNR has no bound: a floater in front of one test camera can
     cost its view 10 dB, which is more than all other views gain together.
-
-    Args:
-        comparison: The pairs of cells.
-        views: `Sweep.views`.
 
     Returns:
         (label, condition) -> a sentence for each such pair: the view, and the change with and

@@ -23,11 +23,7 @@ _NOT_REACHED = "not reached"
 
 
 def joined(cells: pd.DataFrame, done: Mapping[str, DoneCell]) -> pd.DataFrame:
-    """Join the curves of all cells that were evaluated during training.
-
-    Args:
-        cells: The table `Comparison.cells`.
-        done: The cells that are done, by their ids.
+    """Join the curves of all of `Comparison.cells` that were evaluated during training.
 
     Returns:
         One row for each evaluation, with `CELL_KEYS` and `CURVE_COLUMNS`, by cell and step.
@@ -101,11 +97,7 @@ def first_reaches(quality: Sequence[float], amounts: Sequence[float], target: fl
 
 
 def times(cells: pd.DataFrame, done: Mapping[str, DoneCell]) -> pd.DataFrame:
-    """Return the time and work in which each cell reaches the final PSNR of its base.
-
-    Args:
-        cells: The table `Comparison.cells`.
-        done: The cells that are done, by their ids.
+    """Return the time and work in which each of `Comparison.cells` reaches its base's final PSNR.
 
     Returns:
         One row for each cell that was evaluated during training and whose base is done:

@@ -87,15 +87,7 @@ def draw(
     For each condition: the trade-offs of its ablations if there are several, and quality during
     training if it was evaluated. For each setting with at least three values: the changes over it.
     For each scene and ablation: views and training curves of the first condition and replicate,
-    which the titles name.
-
-    Args:
-        store: The stores with the photographs, renders and histories.
-        comparison: The pairs of cells.
-        views: The table `Sweep.views`.
-        quality: The table that `xrgs.report.curves.joined` returns.
-        folder: The existing folder to write the files to.
-        names: File names without suffix of the pictures to draw; None draws the first 40.
+    which the titles name. `names` are their files without suffix; None draws the first 40.
 
     Returns:
         The pictures, in the order of the tables.
@@ -195,9 +187,6 @@ def sensitivities(comparison: Comparison) -> dict[str, pd.DataFrame]:
 
     The values are read from labels, for a setting of the ablation (`consistency.weight=0.05`), and
     from conditions, for a setting that the base has too (`variant.factor=2`).
-
-    Args:
-        comparison: The pairs of cells and their means.
 
     Returns:
         Key of a setting with at least three values -> one row for each change: `level` (`pair`,

@@ -92,11 +92,7 @@ _KINDS = {
 
 
 def totals(cells: pd.DataFrame, done: Mapping[str, DoneCell]) -> pd.DataFrame:
-    """Return the counts of training in each done cell.
-
-    Args:
-        cells: The table `Comparison.cells`.
-        done: The cells that are done, by their ids.
+    """Return the counts of training in each of `Comparison.cells` that is done.
 
     Returns:
         One row for each cell: `CELL_KEYS`, and a column for each count of its history (at the end
@@ -161,11 +157,7 @@ def _work(cell: DoneCell) -> dict[str, float]:
 
 
 def skipped(cells: pd.DataFrame, done: Mapping[str, DoneCell]) -> pd.DataFrame:
-    """Return the work that each cell skipped.
-
-    Args:
-        cells: The table `Comparison.cells`.
-        done: The cells that are done, by their ids.
+    """Return the work that each of `Comparison.cells` skipped.
 
     Returns:
         One row for each cell and kind of work with known counts: `CELL_KEYS` and `kind`; the

@@ -119,12 +119,7 @@ _MAX_ROWS = 240
 
 
 def add_curves(content: Content, quality: pd.DataFrame) -> None:
-    """Add the quality during training of each cell that was evaluated during training.
-
-    Args:
-        content: The content of the page.
-        quality: The table that `xrgs.report.curves.joined` returns.
-    """
+    """Add the quality during training of each cell that was evaluated during training."""
     keys = [*RUN, "label"]
     for _, rows in quality.groupby(keys, sort=False):
         first = rows.iloc[0]
@@ -248,14 +243,7 @@ def page_context(
     contexts: Mapping[str, Context],
     variants: Mapping[str, Variant],
 ) -> list[tuple[str, str]]:
-    """Return the rows (name, text) of the page's section on context.
-
-    Args:
-        sweep: The sweep.
-        comparison: The comparison of its cells.
-        contexts: How the cells of each condition were trained and scored.
-        variants: The readable variants of the cells, by their ids.
-    """
+    """Return the rows (name, text) of the page's section on context."""
     cells = comparison.cells
     done = cells[cells["cell_id"].isin(sweep.done)].drop_duplicates("cell_id")
     replicates, planned = done.drop_duplicates(["variant_seed", "seed"]), cells["cell_id"].nunique()

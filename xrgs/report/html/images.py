@@ -114,11 +114,7 @@ def to_image(array: NDArray[np.float32]) -> Image.Image:
 
 
 def error_map(photograph: Image.Image, render: Image.Image) -> Image.Image:
-    """Draw the difference of a render from its photograph.
-
-    Args:
-        photograph: An image of mode RGB.
-        render: An image of mode RGB and the same size.
+    """Draw the difference of a render from its photograph, RGB images of one size.
 
     Returns:
         The mean absolute difference of the channels, from black at 0 to pale yellow at
@@ -275,14 +271,6 @@ def add_trained(
     """Add training views with their renders, models for 3D, and the cameras.
 
     They come from the first replicate of each scene and condition whose variant can be read.
-
-    Args:
-        content: The content of the page.
-        store: The store with the cells.
-        comparison: The comparison of the cells.
-        variants: The readable variants, by their ids.
-        max_image_bytes: The most bytes of the images.
-        max_model_bytes: The most bytes of the models as base64.
     """
     first: dict[tuple[str, str], pd.DataFrame] = {}
     for rows in runs(comparison):
