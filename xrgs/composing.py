@@ -91,9 +91,6 @@ def _own_hydra() -> Iterator[ModuleType]:
 def to_conf(cfg: DictConfig) -> Conf:
     """Convert a config from Hydra to a `Conf`, and check ranges and choices.
 
-    Args:
-        cfg: A config composed from `conf/config.yaml`, whose defaults contain the schema.
-
     Returns:
         The config, with resolved interpolations.
 
@@ -247,9 +244,6 @@ def from_dict(values: Any) -> Conf:
     Interpolations are not resolved: a path may contain `${`, and a file of unknown origin must not
     read this process's environment.
 
-    Args:
-        values: Nested dicts of plain values, with every key.
-
     Raises:
         XrgsError: A key is unknown or missing, or a value is of the wrong type; the message names
             the key.
@@ -317,9 +311,6 @@ def from_file(file: Path) -> tuple[Conf, dict[str, Any]]:
     means "off". Settings of components that have moved to `examples/arms` become those of the
     plugin, if the component was on.
 
-    Args:
-        file: The JSON file.
-
     Returns:
         The config, and missing key -> value that was inserted.
 
@@ -373,9 +364,6 @@ def _baseline() -> Any:
 
 def error_line(error: Exception) -> str:
     """Return the first line of an error's message, with the config's key.
-
-    Args:
-        error: Any exception. OmegaConf's exceptions have a key, which the message may lack.
 
     Returns:
         One line, prefixed with the key if the message does not contain it.

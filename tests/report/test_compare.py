@@ -174,15 +174,6 @@ def test_pairs_are_of_one_seed(made: Any) -> None:
     assert list(pairs["effect"]) == pytest.approx([math.log(1.5)] * 2)
 
 
-def test_conditions_are_compared_apart(made: Any) -> None:
-    for condition, factor in (("train.steps=100", 0.5), ("train.steps=200", 2.0)):
-        made.add(condition=condition)
-        made.add("consistency", condition=condition, factors={"gaussians": factor})
-    means = compared(made).means["change"]
-    assert means["consistency", "train.steps=100", "gaussians"] == pytest.approx(-50.0)
-    assert means["consistency", "train.steps=200", "gaussians"] == pytest.approx(100.0)
-
-
 def test_a_failed_cell_is_left_out_and_said_to_be(made: Any) -> None:
     made.add()
     made.add("consistency", state="failed")
@@ -481,13 +472,3 @@ def test_a_cell_whose_base_failed_or_was_not_planned_says_so(made: Any) -> None:
     assert reasons["fern", "baseline"] == "no plus: RuntimeError: out of luck"
     assert reasons["room", "xrgs"] == "no plus: not planned for its scene, condition and replicate"
     assert reasons["trex", "xrgs"] == "trex: 3 of 24 views registered"
-
-
-def test_the_gap_starts_at_the_base(made: Any) -> None:
-    add_gap(made)
-    made.add("plus", values={"psnr": 22.0})
-    gaps = compared(made, "plus").gaps["change"].xs("psnr", level="metric")
-    assert gaps.droplevel("condition").to_dict() == pytest.approx(
-        {"consistency": 50.0, "baseline": -100.0}
-    )
-    assert compared(made, "all_hr").gaps.empty

@@ -111,13 +111,6 @@ def test_a_mixture_without_lr_views_is_cautioned(
     assert ("Caution: fern has no LR view: nothing is mixed" in cautions) == said
 
 
-def test_scenes_whose_lr_views_differ_are_both_said(made: Any) -> None:
-    configured(made.add())
-    configured(made.add(scene="leaves"), variant={"tags": "sampling_rate", "factor": 2})
-    text = found(made)[""].of_scores
-    assert "LR views 5 times smaller or LR by sampling_rate (nothing degraded)" in text
-
-
 @pytest.mark.parametrize(
     ("variant", "said"),
     [
@@ -125,18 +118,13 @@ def test_scenes_whose_lr_views_differ_are_both_said(made: Any) -> None:
         ({"degradation": "phone"}, "LR views 5 times smaller, by phone;"),
         ({"degradation": "jpeg"}, "LR views by jpeg;"),
         ({"degradation": "of another version"}, "LR views by of another version;"),
+        ({"hr_fraction": 1.0}, "all views HR"),
+        ({"tags": "sampling_rate", "factor": 2}, "LR by sampling_rate (nothing degraded);"),
     ],
 )
 def test_how_lr_views_were_made_is_said(made: Any, variant: dict[str, Any], said: str) -> None:
     configured(made.add(), variant=variant)
     assert said in found(made)[""].of_scores
-
-
-def test_a_sweep_without_lr_views_names_none(made: Any) -> None:
-    configured(made.add(), variant={"hr_fraction": 1.0})
-    text = found(made)[""].of_scores
-    assert "all views HR" in text
-    assert "LR" not in text
 
 
 def test_values_of_a_stranger_are_shown_as_they_are(made: Any) -> None:

@@ -6,7 +6,6 @@ from typing import Any
 import pytest
 
 from xrgs.evaluation.metrics import METRICS
-from xrgs.report import build
 from xrgs.report.compare import compare
 from xrgs.report.work import skipped, skipped_table, totals, totals_table
 
@@ -65,15 +64,6 @@ def test_the_table_has_means_over_seeds_scene_by_scene(made: Any) -> None:
         ("horns", "Gaussians split", "9", ""),
         ("horns", "Opacities reset", "0", ""),
     )
-
-
-def test_conditions_are_tables_of_their_own(made: Any) -> None:
-    made.add(history=_BASELINE)
-    made.add(history=_NOTED.format(split=5), condition="variant.factor=3")
-    found = _totals(made)
-    assert ("fern", "Gaussians split", "9") in totals_table(found, ["baseline"], "").rows
-    rows = totals_table(found, ["baseline"], "variant.factor=3").rows
-    assert ("fern", "Gaussians split", "5") in rows
 
 
 WORK = {
@@ -166,16 +156,6 @@ def test_the_table_has_what_some_run_left_out(made: Any) -> None:
     assert number[0] == "250 (25.0%)"
     assert cost[0] == "10 G (10.0 times)"
     assert texts["Harmonics of visible Gaussians in bands that were not on"][1][0] == "unknown"
-
-
-def test_an_ablation_without_its_baseline_is_listed(made: Any) -> None:
-    made.add(state="failed")
-    made.add("lean", summary=SUMMARY)
-    made.write()
-    report = build(made.store.path, pictures=[])
-    assert "What each run left out" in (report.folder / "table.md").read_text()
-    text = (report.folder / "skipped.csv").read_text()
-    assert ",lean,,0,0,pixels,2000.0,0.2," in text
 
 
 def test_malformed_totals_cost_their_cell_alone(made: Any) -> None:

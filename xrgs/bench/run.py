@@ -62,9 +62,6 @@ _LR_FACTOR = 5
 def run(settings: Settings) -> str:
     """Run the benchmark, or instead `save` or `against`, if set.
 
-    Args:
-        settings: The arguments of `xrgs-bench`.
-
     Returns:
         The text to print.
 

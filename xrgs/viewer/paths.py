@@ -62,10 +62,6 @@ def orbit(poses: Poses, views: int) -> Array:
     forward-facing scene, the path swings to and fro over their arc, since the scene was not
     photographed from elsewhere.
 
-    Args:
-        poses: The cameras and points of the scene.
-        views: Number of cameras, at least 1.
-
     Returns:
         [views, 4, 4] world to camera. The path can be repeated without a jump.
     """
@@ -93,10 +89,6 @@ def spiral(poses: Poses, views: int) -> Array:
     the mean camera are the 90th percentiles of the cameras' offsets. All cameras look at one point
     on the mean camera's axis, at the harmonic mean of 0.9 times the nearest and 5 times the
     farthest depth of the points, with weights 1/4 and 3/4.
-
-    Args:
-        poses: The cameras and points of the scene.
-        views: Number of cameras, at least 1.
 
     Returns:
         [views, 4, 4] world to camera. The path can be repeated without a jump.
@@ -130,10 +122,6 @@ def through_test_views(poses: Poses, views: int) -> Array:
     Positions are interpolated by cubic Hermite polynomials that don't overshoot (PCHIP), rotations
     at constant angular velocity. The first camera is the first test view, the last one the last.
 
-    Args:
-        poses: The cameras and points of the scene.
-        views: Number of cameras, at least 1.
-
     Returns:
         [views, 4, 4] world to camera.
     """
@@ -145,10 +133,6 @@ def through_training_views(poses: Poses, views: int) -> Array:
 
     It passes through evenly chosen cameras, one for every ten frames: through all of many cameras
     it would shake. In between it is interpolated as in `through_test_views`.
-
-    Args:
-        poses: The cameras and points of the scene.
-        views: Number of cameras, at least 1.
 
     Returns:
         [views, 4, 4] world to camera.
@@ -176,9 +160,6 @@ def default_path(poses: Poses) -> str:
     than the focus is, and looks the same way to 60 degrees. That holds around an object, and on the
     arc in front of a forward-facing scene. In a scene seen from inside, the training cameras look
     outwards and an orbit looks inwards.
-
-    Args:
-        poses: The cameras and points of the scene.
     """
     path = orbit(poses, _PROBES)
     places, focus = camera_positions(path), look_at_point(poses)
