@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import json
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 import pytest
 from omegaconf import OmegaConf
 
+from xrgs.composing import from_dict
 from xrgs.config import CONF_DIR, Conf
 from xrgs.store import identity
 from xrgs.sweep.axes import expand
@@ -68,6 +70,7 @@ def test_each_ablation_is_another_cell(name: str, composed: Compose) -> None:
     assert cell_id(ablation) != cell_id(baseline)
     changed = delta(ablation, baseline)
     assert {key.split(".")[0] for key in changed} <= {"components", "splat", "train", "matched_to"}
+    assert from_dict(json.loads(json.dumps(asdict(ablation)))) == ablation
 
 
 def test_no_two_ablations_are_the_same_cell(composed: Compose) -> None:

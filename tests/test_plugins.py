@@ -9,7 +9,6 @@ from dataclasses import asdict
 from pathlib import Path
 
 import pytest
-import torch
 
 from tests.conftest import composed as compose
 from xrgs import plugins
@@ -255,22 +254,3 @@ def test_settings_come_from_the_command_line() -> None:
     assert from_dict(asdict(conf)) == conf
     with pytest.raises(XrgsError, match=r"^components\.plugins\.one=0\.5: must be a mapping"):
         compose("+components.plugins.one=0.5")
-
-
-def test_a_plugin_may_add_a_term_of_the_gaussians(
-    install: Install, baseline: Conf, data: Dataset
-) -> None:
-    """The loop hands the Gaussians to `modify_loss`, and their gradients reach the optimizer."""
-    from xrgs.training import loop
-
-    source = SOURCE + (
-        "\n    def modify_loss(self, loss, image, gaussians, step):"
-        "\n        return loss + self.settings.weight * gaussians.opacities.sigmoid().mean()\n"
-    )
-    install("dist", {"one": "one:Plugin"}, {"one.py": source})
-    baseline.splat.backend, baseline.train.steps = "auto", 10
-    plain = loop.train(data, baseline).gaussians
-    baseline.components.plugins = {"one": {"weight": 10.0}}
-    regularised = loop.train(data, baseline).gaussians
-    means = [torch.sigmoid(gaussians.opacities).mean() for gaussians in (plain, regularised)]
-    assert means[1] < 0.9 * means[0]

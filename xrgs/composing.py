@@ -113,7 +113,6 @@ def to_conf(cfg: DictConfig) -> Conf:
     _expand_home(conf)
     _check_ranges(conf)
     _check_optimizer(conf.splat.optimizer)
-    _check_sfm_seed(conf)
     _check_choices(conf)
     _check_strategy(conf)
     return conf
@@ -155,6 +154,10 @@ def _check_ranges(conf: Conf) -> None:
     for key, value, least in least_values:
         if not value >= least:
             raise XrgsError(f"{key}={value}: must be at least {least}")
+    if (seed := conf.variant.sfm.seed) >= 2**31:
+        raise XrgsError(
+            f"variant.sfm.seed={seed}: must be below 2^31 = {2**31}, as COLMAP holds it"
+        )
     for name in ("validation", "hr_share"):
         if not 0 <= (share := getattr(conf.train, name)) < 1:
             raise XrgsError(f"train.{name}={share}: must be from 0 to below 1")
@@ -176,14 +179,6 @@ def _check_optimizer(optimizer: OptimizerSettings) -> None:
             )
     if not 0 <= (power := optimizer.length_power) <= 1:
         raise XrgsError(f"splat.optimizer.length_power={power}: must be from 0 to 1")
-
-
-def _check_sfm_seed(conf: Conf) -> None:
-    """Raise `XrgsError` if the seed of SfM is too large for COLMAP."""
-    if (seed := conf.variant.sfm.seed) >= 2**31:
-        raise XrgsError(
-            f"variant.sfm.seed={seed}: must be below 2^31 = {2**31}, as COLMAP holds it"
-        )
 
 
 def _check_choices(conf: Conf) -> None:

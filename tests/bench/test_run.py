@@ -52,6 +52,18 @@ def test_every_backend_is_timed_on_every_load(smoke: Smoke) -> None:
 
 
 @pytest.mark.slow
+def test_a_process_grows_by_the_counted_bytes_and_not_by_the_imports(smoke: Smoke) -> None:
+    row = smoke[2]["memory"]
+    gaussians, *size = run.SMOKE.memory
+    assert [row["gaussians"], row["width"], row["height"]] == [gaussians, *size]
+    model = 4 * gaussians * (3 + 4 + 3 + 1 + 48) / 2**20
+    assert row["counted_mib"] > 4 * model  # parameters, gradients, two moments
+    if Path("/proc/self/status").exists():
+        assert row["base_rss_mib"] > 50  # torch alone
+        assert row["growth_mib"] == row["peak_rss_mib"] - row["base_rss_mib"] > 3 * model
+
+
+@pytest.mark.slow
 def test_a_higher_cutoff_costs_accuracy(smoke: Smoke) -> None:
     rows = [row for row in smoke[2]["rows"] if row["gaussians"] == max(run.SMOKE.gaussians)]
     by_method = {row["method"]: row for row in rows}

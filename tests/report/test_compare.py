@@ -16,7 +16,6 @@ from xrgs.report.inference import (
     NO_ALL_HR,
     NO_GAP,
     NOT_FINITE,
-    NOT_MEASURED,
     NOT_POSITIVE,
     OTHER_CODE,
     OTHER_MACHINE,
@@ -80,23 +79,6 @@ def test_the_papers_table_1(made: Any) -> None:
         assert interval == f"{low:+.2f} to {high:+.2f}"
 
 
-def test_psnr_is_compared_in_db_and_all_else_by_ratio(made: Any) -> None:
-    for scene, off in zip(SCENES, SCATTER, strict=True):
-        made.add(scene=scene)
-        factors = {"lpips": math.exp(off / 100), "ssim": math.exp(off / 100)}
-        values = {"psnr": 21 + off / 10}
-        made.add("consistency", scene=scene, factors=factors, values=values)
-    comparison = compared(made)
-    offs = np.array(SCATTER)
-    for name in ("lpips", "ssim"):
-        row = mean_of(comparison, name)
-        wanted = [100 * math.expm1(end) for end in interval_of(offs / 100)]
-        assert (row["low"], row["high"]) == pytest.approx(wanted)
-    row = mean_of(comparison, "psnr")
-    assert row["change"] == pytest.approx(1.0)
-    assert (row["low"], row["high"]) == pytest.approx(tuple(interval_of(1 + offs / 10)))
-
-
 def test_the_worst_view_and_the_pooled_error_are_of_each_cells_views(made: Any) -> None:
     made.add()  # of 20.05 and 19.95 dB
     cell = made.add("consistency")
@@ -134,19 +116,6 @@ def test_an_optional_score_is_compared_where_a_cell_has_it(made: Any) -> None:
     made.add(seed=1, values={"psnr_plain": 20.0})
     made.add("consistency", seed=1, values={"psnr_plain": 22.0})
     assert mean_of(compared(made), "psnr_plain")["change"] == pytest.approx(2.0)
-
-
-def test_scenes_count_once_however_many_seeds_they_have(made: Any) -> None:
-    for seed, factor in enumerate((1.1, 1.2, 1.3)):
-        made.add(seed=seed)
-        made.add("consistency", seed=seed, factors={"gaussians": factor, "ssim": factor})
-    made.add(scene="room")
-    made.add("consistency", scene="room", factors={"gaussians": 2.0, "ssim": 2.0})
-    comparison = compared(made)
-    row = mean_of(comparison, "gaussians")
-    assert (row["n"], row["unit"], row["scenes"]) == (2, "scenes", 2)
-    geometric = math.sqrt((1.1 * 1.2 * 1.3) ** (1 / 3) * 2.0)
-    assert row["change"] == pytest.approx(100 * (geometric - 1))
 
 
 def test_one_scene_has_its_interval_over_seeds(made: Any) -> None:
@@ -187,14 +156,6 @@ def test_a_failed_cell_is_left_out_and_said_to_be(made: Any) -> None:
         *["RuntimeError: out of luck"] * 2,
         "no baseline: RuntimeError: out of luck",
     ]
-
-
-def test_a_metric_that_one_view_lacks_is_not_averaged(made: Any) -> None:
-    made.add(values={"lpips": None})
-    made.add("consistency", values={"lpips": None})
-    row = mean_of(compared(made), "lpips")
-    assert math.isnan(row["change"])
-    assert row["why"] == NOT_MEASURED
 
 
 def test_a_pair_that_is_left_out_does_not_narrow_the_interval(made: Any) -> None:
@@ -424,26 +385,6 @@ def test_the_arithmetic_does_not_grow_faster_than_the_cells(made: Any) -> None:
     change = ablation["psnr"] - base["psnr"]
     by_scene = [np.mean(change[np.array(scenes) == name]) for name in dict.fromkeys(scenes)]
     assert mean_of(comparison, "psnr", "a")["change"] == pytest.approx(np.mean(by_scene))
-
-
-def test_another_label_is_the_base_of_its_own_scene_condition_and_replicate(made: Any) -> None:
-    for number, (scene, condition, seed) in enumerate(
-        [("fern", "", 0), ("fern", "", 1), ("room", "", 0), ("fern", "train.steps=9", 0)]
-    ):
-        for label, psnr in (("baseline", 10.0), ("plus", 20.0 + number), ("xrgs", 40.0)):
-            made.add(label, scene=scene, condition=condition, seed=seed, values={"psnr": psnr})
-    comparison = compared(made, "plus")
-    pairs = comparison.pairs.query("metric == 'psnr'")
-    xrgs, baseline = pairs[pairs["label"] == "xrgs"], pairs[pairs["label"] == "baseline"]
-    assert comparison.base == "plus"
-    assert dict.fromkeys(label for label, _ in comparison.groups) == {
-        "baseline": None,
-        "xrgs": None,
-    }
-    assert list(xrgs["base"]) == pytest.approx([20, 21, 22, 23])
-    assert list(baseline["effect"]) == pytest.approx([10 - base for base in (20, 21, 22, 23)])
-    assert comparison.means.loc[("xrgs", "train.steps=9", "psnr"), "base"] == pytest.approx(23)
-    assert comparison.missing().empty
 
 
 def test_cells_of_a_sweep_without_a_baseline_are_compared_with_that_of_a_joined_one(

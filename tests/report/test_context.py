@@ -193,8 +193,6 @@ def test_each_replicate_is_judged_by_itself(made: Any) -> None:
     "changes",
     [
         pytest.param([0.02, 0.01, 0.0, 0.01, -0.5], id="less than 0.3 dB of the mean"),
-        pytest.param([10.0, 10.1, 9.9, 10.0, 3.0], id="a small share of a large change"),
-        pytest.param([4.0, 0.9, 0.4, -0.1, -3.5], id="others as far"),
         pytest.param([1.0, 1.0, 1.0], id="no scatter"),
         pytest.param([1.0, 1.1, float("inf"), float("nan")], id="too few finite ones"),
     ],

@@ -1,6 +1,5 @@
 """Quality during training and the time to the baseline's quality, from curves written by hand."""
 
-import csv
 import math
 from dataclasses import replace
 from typing import Any
@@ -10,7 +9,6 @@ import pandas as pd
 import pytest
 
 from xrgs.evaluation.metrics import METRICS
-from xrgs.report import build
 from xrgs.report.collect import CURVE_COLUMNS
 from xrgs.report.compare import compare
 from xrgs.report.curves import (
@@ -186,24 +184,6 @@ def test_means_are_over_what_all_have() -> None:
     assert means["baseline", 100] == 16.0, "leaves has no plus"
     assert np.isnan(means["baseline", 200])
     assert means["plus", 100] == 20.0
-
-
-def test_the_report_has_figure_tables_and_files(made: Any) -> None:
-    for label in ("baseline", *(f"arm {number}" for number in range(1, 9))):
-        made.add(label, quality=BASELINE)
-    made.add(condition="factor=8/x")
-    made.write()
-    report = build(made.store.path, pictures=["time-to-quality", "time-to-quality-2"])
-    page = (report.folder / "table.md").read_text()
-    assert "Work and time to the PSNR at which baseline ends" in page
-    assert "figures/time-to-quality-2.png" in page
-    with (report.folder / "curves.csv").open(newline="") as stream:
-        rows = list(csv.DictReader(stream))
-    assert len(rows) == 9 * 5
-    assert rows[0]["label"] == "baseline"
-    assert float(rows[0]["psnr"]) == 15.0
-    with (report.folder / "time_to_quality.csv").open(newline="") as stream:
-        assert {float(row["seconds_share"]) for row in csv.DictReader(stream)} == {1.0}
 
 
 def test_a_malformed_curve_costs_its_cell_alone(made: Any) -> None:

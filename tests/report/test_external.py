@@ -168,34 +168,32 @@ def test_wrong_figures_are_refused(
         with_external(sweep, ReportStore(made.store.path), [External("o", folder)])
 
 
-def broken(folder: Path, how: str) -> None:
-    file = folder / f"{VIEWS[1]}.png"
-    file.unlink()
-    if how == "size":
-        save(file, noise(0, (33, 24)))
-    elif how == "mode":
-        Image.fromarray(noise(0)).convert("RGBA").save(file)
-
-
 @pytest.mark.parametrize(
-    ("how", "why"),
+    ("size", "mode", "why"),
     [
-        ("missing", "No such file"),
-        ("size", "33 x 24 pixels, not 32 x 24"),
-        ("mode", "RGBA, not 8-bit RGB"),
+        (None, "", "No such file"),
+        ((33, 24), "RGB", "33 x 24 pixels, not 32 x 24"),
+        (SIZE, "RGBA", "RGBA, not 8-bit RGB"),
     ],
 )
 def test_a_render_that_can_not_be_scored_is_named(
-    made: MakeStore, frozen_variant: Callable[..., str], tmp_path: Path, how: str, why: str
+    made: MakeStore,
+    frozen_variant: Callable[..., str],
+    tmp_path: Path,
+    size: tuple[int, int] | None,
+    mode: str,
+    why: str,
 ) -> None:
     made.add(variant=frozen_variant())
-    sweep = made.read()
-    folder = rendered(tmp_path / "renders")
-    broken(folder, how)
+    file = rendered(tmp_path / "renders") / f"{VIEWS[1]}.png"
+    file.unlink()
+    if size:
+        Image.fromarray(noise(0, size)).convert(mode).save(file)
+    sweep, other = made.read(), External("gsplat", tmp_path / "renders")
     with pytest.raises(ReportError) as caught:
-        with_external(sweep, ReportStore(made.store.path), [External("gsplat", folder)])
+        with_external(sweep, ReportStore(made.store.path), [other])
     message = str(caught.value)
-    assert message.startswith(str(folder / "IMG_009.png"))
+    assert message.startswith(str(file))
     assert why in message
     assert "expected is an 8-bit RGB PNG of 32 x 24 px, the render of the view IMG_009" in message
 

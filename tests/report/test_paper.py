@@ -74,15 +74,6 @@ def test_two_values_leave_a_sign_open(made: Any) -> None:
     assert signs(table)["Gaussians"] == "open"
 
 
-def test_each_reading_of_full_xr_gs_has_its_rows(made: Any) -> None:
-    for scene in SCENES:
-        made.add(scene=scene)
-        for label in ("consistency", "xrgs_per_class", "xrgs"):
-            made.add(label, scene=scene)
-    (table,) = tables(made)
-    assert list(dict.fromkeys(row[0] for row in table.rows)) == ["xrgs", "xrgs_per_class"]
-
-
 @pytest.mark.parametrize(
     ("scene", "column"), [("monstree", "Dining Room"), ("keychain", "Keychain")]
 )

@@ -190,7 +190,8 @@ def _cautions(
         f"{scene} has no view held out (variant.test_every=0): its scores are of views that were"
         " trained on"
         for scene, config in configs
-        if config and not _holds_out(config)
+        if config
+        and not (config.variant.test_every or config.variant.test or config.train.validation)
     ]
     return tuple(
         for_line(f"Caution: {text}", _MAX_SENTENCE) for text in dict.fromkeys((*few, *trained_on))
@@ -217,12 +218,6 @@ def _cautions_of_photographs(rows: pd.DataFrame, sweep: Sweep) -> list[str]:
         if unmixed:
             texts.append(f"{scene} has no LR view: nothing is mixed")
     return [for_line(f"Caution: {text}", _MAX_SENTENCE) for text in texts]
-
-
-def _holds_out(config: Conf) -> bool:
-    """Return whether a cell is scored on views that it was not trained on."""
-    variant = config.variant
-    return bool(variant.test_every or variant.test or config.train.validation)
 
 
 _PAIR = ["label", "condition", "scene", "variant_seed", "seed"]

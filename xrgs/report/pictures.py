@@ -15,7 +15,7 @@ from xrgs.errors import StoreError, UnreadableError
 from xrgs.photos import images
 from xrgs.photos.images import ImageError
 from xrgs.report.collect import ReportError
-from xrgs.report.compare import is_ratio
+from xrgs.report.compare import is_ratio, run_name
 from xrgs.report.curves import means_over_runs, means_over_scenes
 from xrgs.report.figures import (
     MAX_ARMS,
@@ -330,9 +330,9 @@ def _views(
     file: Path,
 ) -> Picture:
     if psnr[0].empty:
-        return Picture(_title(pair), None, "the two cells have no scored view in common")
+        return Picture(run_name(pair), None, "the two cells have no scored view in common")
     view = median_view(*psnr)
-    title = f"{_title(pair)}: view {view}, by change of PSNR the median of {len(psnr[0])}"
+    title = f"{run_name(pair)}: view {view}, by change of PSNR the median of {len(psnr[0])}"
     name = f"{view}.png"
     try:
         check_images(variant.parent, variant.name)
@@ -349,27 +349,19 @@ def _views(
     if len({panel.image.shape for panel in panels}) > 1:
         return Picture(title, None, f"{view}: photograph and renders differ in size")
     note = f"where {base} and {pair['label']} differ most"
-    with atomic_writer(file) as stream:
-        stream.write(side_by_side(title, panels, differing_crop(before, ablation), note))
-    return Picture(title, file)
+    crop = differing_crop(before, ablation)
+    return _drawn(title, partial(side_by_side, title, panels, crop, note), file)
 
 
 def _training(store: ReportStore, pair: pd.Series, base: str, file: Path) -> Picture:
-    title = f"{_title(pair)}: training"
+    title = f"{run_name(pair)}: training"
     runs = []
     for name, key in ((base, "base_id"), (str(pair["label"]), "cell_id")):
         try:
             runs.append((name, store.cell(pair[key]).history()[["step", *_CURVES]]))
         except (StoreError, KeyError):
             return Picture(title, None, f"cells/{pair[key]}/history.csv can't be read")
-    with atomic_writer(file) as stream:
-        stream.write(curves(title, runs, _CURVES))
-    return Picture(title, file)
-
-
-def _title(pair: pd.Series) -> str:
-    parts = (pair["scene"], pair["label"], pair["condition"], f"seed {pair['seed']}")
-    return ", ".join(str(part) for part in parts if part)
+    return _drawn(title, partial(curves, title, runs, _CURVES), file)
 
 
 def _image(store: ReportStore, file: Path) -> NDArray[np.float32]:

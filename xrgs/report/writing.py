@@ -155,7 +155,7 @@ def verdict(row: Change, metric: Metric) -> str:
 
 
 def marked(row: Change | None, metric: Metric, scenes: int) -> str:
-    """Write a mean over so many scenes with its marks: `-44.57 ↑ * (3 of 4)`.
+    """Write a mean over `scenes` scenes with its marks: `-44.57 ↑ * (3 of 4)`.
 
     Returns:
         The change, `*` if it is shown to be better or worse, `≈` if it is equivalent, and the
