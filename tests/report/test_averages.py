@@ -34,14 +34,6 @@ def test_scenes_are_counted_by_the_sign_of_their_mean(made: Any) -> None:
     assert tuple(same[["up", "down", "n", "p_sign"]]) == (0, 0, 4, 1.0)
 
 
-def test_the_signs_of_a_single_scene_are_of_its_replicates(made: Any) -> None:
-    for seed, factor in enumerate((1.1, 1.2, 0.9)):
-        made.add(seed=seed)
-        made.add("consistency", seed=seed, factors={"psnr": factor})
-    row = mean_of(compared(made), "psnr")
-    assert tuple(row[["up", "down", "n", "unit"]]) == (2, 1, 3, "replicates")
-
-
 def add_nested(made: Any, changes: dict[str, tuple[float, ...]], metric: str = "psnr") -> None:
     """Pairs of each scene: dB of PSNR, or logarithms times 100 of an amount."""
     for scene, of_scene in changes.items():
@@ -129,15 +121,6 @@ def test_headline_labels_are_corrected_by_holm_among_themselves(made: Any) -> No
     assert means["holm"].xs("b", level="label").isna().all()
     assert means["holm"].notna().sum() == 6
     assert means["q"].notna().sum() == 9
-
-
-def test_what_is_no_outcome_is_no_test(made: Any) -> None:
-    add_random(made, ("a",), {"": 3})
-    design = Design(outcomes=("ssim",))
-    means = compare(made.read().cells, METRICS, design=design).means.droplevel([0, 1])
-    assert means.index[means["outcome"]].tolist() == ["ssim"]
-    assert means["q"]["ssim"] == pytest.approx(means["p"]["ssim"])
-    assert means["q"].notna().sum() == means["p_equivalent"].notna().sum() == 1
 
 
 def test_equal_values_are_no_members_of_the_family(made: Any) -> None:

@@ -189,19 +189,6 @@ def test_each_replicate_is_judged_by_itself(made: Any) -> None:
     assert len(found) == 2
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        pytest.param([0.02, 0.01, 0.0, 0.01, -0.5], id="less than 0.3 dB of the mean"),
-        pytest.param([1.0, 1.0, 1.0], id="no scatter"),
-        pytest.param([1.0, 1.1, float("inf"), float("nan")], id="too few finite ones"),
-    ],
-)
-def test_what_no_view_decides_has_no_caution(made: Any, changes: list[float]) -> None:
-    comparison = compared(made, "plus")
-    assert decided_by_one_view(comparison, views_of(comparison, {"plus": [*changes]})) == {}
-
-
 @given(st.lists(st.integers(-2000, 2000), min_size=3, max_size=9, unique=True))
 def test_it_is_what_leaving_out_each_view_in_turn_says(hundredths: list[int]) -> None:
     scores = 20.0 + np.array(hundredths) / 100

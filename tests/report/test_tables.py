@@ -145,36 +145,6 @@ def test_a_title_lists_up_to_eight_seeds(made: Any) -> None:
     assert title == "consistency against baseline: scene fern, 9 replicates"
 
 
-def test_a_title_names_replicates_that_have_variants_of_their_own(made: Any) -> None:
-    for seed in range(3):
-        made.add(draw=seed, seed=seed, variant=f"v{seed}")
-        made.add("consistency", draw=seed, seed=seed, variant=f"v{seed}")
-    made.add(draw=3, variant="v3", state="failed")
-    built = tables(made)
-    title = built.mean("consistency", "").title
-    assert title.endswith("scene fern, replicates 0/0, 1/1, 2/2 (variant.seed/seed)")
-    missing = built.missing()
-    assert missing is not None
-    assert missing.rows[0][3:5] == ("3", "0")
-
-
-def test_several_ablations_of_a_condition_stand_beside_each_other(made: Any) -> None:
-    for condition, share in (("train.steps=10", 0.5), ("train.steps=20", 2.0)):
-        made.add(condition=condition)
-        made.add("consistency", condition=condition, factors={"gaussians": share})
-        made.add("loss_weighting", condition=condition, state="failed")
-    made.add(condition="one")
-    made.add("consistency", condition="one")  # one ablation needs no overview
-    table, other = tables(made).overviews()
-    assert table.title == "Change from baseline, mean over scenes (train.steps=10)"
-    assert other.title == "Change from baseline, mean over scenes (train.steps=20)"
-    rows = rows_of(table)
-    assert rows["consistency"]["Gaussians, %"] == "-50.00 ↑"
-    assert rows["loss_weighting"]["Gaussians, %"] == "missing"
-    assert "SSIM, %" not in table.columns, "it is no outcome"
-    assert (table.columns[0], table.align, table.notes) == ("Ablation", "lrrrrrr", ())
-
-
 def test_pairs_left_out_of_a_mean_are_named(made: Any) -> None:
     made.add(values={"gaussians": 0})
     made.add("consistency")
@@ -261,17 +231,6 @@ def test_the_legend_explains_only_what_occurs_and_fits_a_terminal(made: Any) -> 
     assert 80 < max(map(len, lines)) <= 100
     for meaning in terms.values():
         assert meaning in " ".join(" ".join(lines).split())
-
-
-def test_every_title_and_column_names_the_base(made: Any) -> None:
-    add_three(made, "plus", "b")
-    built = tables(made, "plus")
-    (overview,) = built.overviews()
-    assert overview.title == "Change from plus, mean over scenes"
-    assert rows_of(overview)["baseline"]["PSNR, dB"] == "-1.00 ↓ *"
-    assert built.mean("b", "").columns[1:4] == ("plus", "b", "change")
-    assert built.per_scene("b", "").title == "b: change from plus, scene by scene"
-    assert set(built.long()["against"]) == {"plus"}
 
 
 def test_an_ablation_that_is_the_baseline_is_said_to_change_nothing(made: Any) -> None:
