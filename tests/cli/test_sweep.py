@@ -104,6 +104,7 @@ def test_a_cell_that_fails_leaves_the_others_and_is_not_tried_again(
     assert code == 1
     assert len(children.trained) == 3
     assert "retry=failed trains them again" in err
+    children.failures = {1: "it raised", 5: "it raised"}
     code, _, err = sweep_here("seed=1,5", *SCENE, "retry=failed", "fail_fast=true")
     assert code == 1
     assert "no further cell is started: fail_fast, and a cell failed" in err

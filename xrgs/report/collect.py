@@ -259,6 +259,9 @@ def _done_columns(cell_id: str, cell: DoneCell) -> dict[str, Any]:
     figures = msgspec.structs.asdict(cell.summary)
     train, (scored_by, stale) = cell.identity.train, _scored(*cell.status.scored_by.items())
     variant = cell.config.variant if cell.config else None
+    # Times of several machines in turn can't be compared with those of any other cell.
+    turns = cell.provenance.machines_in_turn
+    machine_name = f"cell {cell_id} in turn: {turns}" if turns else machine(cell.provenance)
     return {
         **{metric.name: figures[metric.name] for metric in METRICS if metric.name in figures},
         **{f"{name}_code": scored_by.get(name, "") for name in _SCORES},
@@ -270,7 +273,7 @@ def _done_columns(cell_id: str, cell: DoneCell) -> dict[str, Any]:
         "steps": cell.summary.steps,
         "long_side": variant.long_side if variant else None,
         "factor": variant.factor if variant else None,
-        "machine": _machine(cell_id, cell.provenance),
+        "machine": for_line(machine_name, _MAX_MACHINE),
     }
 
 
@@ -279,16 +282,6 @@ def _scored(*digests: tuple[str, str]) -> tuple[dict[str, str], str]:
     """Return the digests of scores without refactorings, and the names of the stale scores."""
     scored_by = without_refactorings(dict(digests))
     return scored_by, " ".join(stale_scores(scored_by))
-
-
-def _machine(cell_id: str, made: Provenance) -> str:
-    """Return the name of the machine that trained a cell.
-
-    If several machines trained it in turn, the name has the cell's id: its times can't be compared
-    with those of any other cell.
-    """
-    turns = made.machines_in_turn
-    return for_line(f"cell {cell_id} in turn: {turns}" if turns else machine(made), _MAX_MACHINE)
 
 
 def _views(done: Mapping[str, DoneCell]) -> pd.DataFrame:

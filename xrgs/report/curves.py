@@ -115,19 +115,16 @@ def times(cells: pd.DataFrame, done: Mapping[str, DoneCell]) -> pd.DataFrame:
         end = base.curve[-1]
         row = dict(cell[CELL_KEYS]) | {"target": end["psnr"]}
         for name in ("evaluations", "seconds"):
-            row[name], own = (_first_passage(run, name, end["psnr"]) for run in (curve, base.curve))
+            row[name], own = (
+                first_reaches([at["psnr"] for at in run], [at[name] for at in run], end["psnr"])
+                for run in (curve, base.curve)
+            )
             comparable = not cell["elsewhere"] or name != "seconds"
             for share, whole in (("share", end[name]), ("own_share", own)):
                 has_share = comparable and whole > 0
                 row[f"{name}_{share}"] = row[name] / whole if has_share else math.nan
         rows.append(row)
     return pd.DataFrame(rows, columns=[*CELL_KEYS, "target", *_ROWS])
-
-
-def _first_passage(curve: Sequence[Mapping[str, float]], name: str, target: float) -> float:
-    """Return the time or work at which a curve first reaches a PSNR, dB."""
-    quality, amounts = ([at[key] for at in curve] for key in ("psnr", name))
-    return first_reaches(quality, amounts, target)
 
 
 #: Column of `times` -> the row of a table: its name (`{base}` is the base's label), the factor of

@@ -67,7 +67,7 @@ class Report:
 
 @dataclass(frozen=True)
 class Runs:
-    """Tables of the trainings of a sweep, each named as the function that makes it."""
+    """Tables of trainings: `work.totals`, `curves.joined`, `curves.times`, `work.skipped`."""
 
     labels: dict[str, list[str]]
     """The labels of each condition's cells, in the sweep's order."""

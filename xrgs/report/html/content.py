@@ -246,11 +246,11 @@ def page_context(
     """Return the rows (name, text) of the page's section on context."""
     cells = comparison.cells
     done = cells[cells["cell_id"].isin(sweep.done)].drop_duplicates("cell_id")
-    replicates, planned = done.drop_duplicates(["variant_seed", "seed"]), cells["cell_id"].nunique()
+    replicates, planned = done[["variant_seed", "seed"]].to_numpy(), cells["cell_id"].nunique()
     of_many = [
         ("Compared with", shown(comparison.base) if comparison.groups else ""),
         ("Scenes", ", ".join(map(shown, comparison.scenes))),
-        ("Replicates (variant.seed/seed)", _listed(_replicates(replicates))),
+        ("Replicates (variant.seed/seed)", _listed(f"{draw}/{seed}" for draw, seed in replicates)),
         ("Cells", f"{len(done)} of {planned} are done"),
     ]
     rows = of_many if planned > 1 else []
@@ -261,10 +261,6 @@ def page_context(
     provenance = sweep.provenance
     rows += [(name, _listed(provenance.get(key, ["n/a"]))) for key, name in _MADE_WITH.items()]
     return [(name, text) for name, text in rows if text]
-
-
-def _replicates(rows: pd.DataFrame) -> list[str]:
-    return [f"{draw}/{seed}" for draw, seed in zip(rows["variant_seed"], rows["seed"], strict=True)]
 
 
 def _listed(values: Iterable[Any]) -> str:
