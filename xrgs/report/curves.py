@@ -108,12 +108,13 @@ def times(cells: pd.DataFrame, done: Mapping[str, DoneCell]) -> pd.DataFrame:
         that early and fall again). If the base ran on another machine, the ratios of time are NaN.
     """
     rows = []
-    for _, cell in cells[cells["cell_id"].isin(done)].drop_duplicates(CELL_KEYS).iterrows():
+    finished = cells[cells["cell_id"].isin(done)].drop_duplicates(CELL_KEYS)
+    for cell in finished.to_dict("records"):
         curve, base = done[cell["cell_id"]].curve, done.get(cell["base_id"])
         if len(curve) == 1 or base is None or math.isnan(base.curve[-1]["psnr"]):
             continue
         end = base.curve[-1]
-        row = dict(cell[CELL_KEYS]) | {"target": end["psnr"]}
+        row = {key: cell[key] for key in CELL_KEYS} | {"target": end["psnr"]}
         for name in ("evaluations", "seconds"):
             row[name], own = (
                 first_reaches([at["psnr"] for at in run], [at[name] for at in run], end["psnr"])

@@ -166,7 +166,8 @@ def skipped(cells: pd.DataFrame, done: Mapping[str, DoneCell]) -> pd.DataFrame:
         run. The costs are NaN if unknown.
     """
     rows = []
-    for _, cell in cells[cells["cell_id"].isin(done)].drop_duplicates(CELL_KEYS).iterrows():
+    finished = cells[cells["cell_id"].isin(done)].drop_duplicates(CELL_KEYS)
+    for cell in finished.to_dict("records"):
         run = done[cell["cell_id"]]
         work = _work(run)
         for kind, number, whole, cost in _left_out(work, _work(done.get(cell["base_id"], run))):
@@ -175,7 +176,7 @@ def skipped(cells: pd.DataFrame, done: Mapping[str, DoneCell]) -> pd.DataFrame:
             unit = _kind(kind).unit
             total = work["seconds" if unit == "s" else "evaluations"]
             rows.append(
-                dict(cell[CELL_KEYS])
+                {key: cell[key] for key in CELL_KEYS}
                 | {"kind": kind, "number": number, "share": number / whole, "cost": cost}
                 | {"unit": unit, "cost_share": cost / total if total else math.nan}
             )

@@ -65,7 +65,7 @@ def orbit(poses: Poses, views: int) -> Array:
     Returns:
         [views, 4, 4] world to camera. The path can be repeated without a jump.
     """
-    focus, up = look_at_point(poses), _up(poses.train)
+    focus, up = look_at_point(poses), up_direction(poses)
     first = _perpendicular(up)
     second = np.cross(up, first)
     offsets = camera_positions(poses.train) - focus  # [C, 3]
@@ -100,7 +100,7 @@ def spiral(poses: Poses, views: int) -> Array:
     forward = directions.mean(axis=0)
     if np.linalg.norm(forward) < _MIN_FACING:
         raise XrgsError("path=spiral: the cameras don't face one way; take --path orbit")
-    positions, up = camera_positions(poses.train), _up(poses.train)
+    positions, up = camera_positions(poses.train), up_direction(poses)
     centre = positions.mean(axis=0)
     mean_camera = _look_at(centre, forward, up)
     rotation = mean_camera[:3, :3]  # its rows are the axes right, down, forward
@@ -196,11 +196,7 @@ def look_at_point(poses: Poses) -> Array:
 
 def up_direction(poses: Poses) -> Array:
     """Return the mean up direction of the training cameras' images, a unit vector [3]."""
-    return _up(poses.train)
-
-
-def _up(viewmats: Array) -> Array:
-    up = -viewmats[:, 1, :3].mean(axis=0)
+    up = -poses.train[:, 1, :3].mean(axis=0)
     return np.asarray(up / np.linalg.norm(up))
 
 
