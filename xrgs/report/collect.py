@@ -290,7 +290,8 @@ def _views(done: Mapping[str, DoneCell]) -> pd.DataFrame:
     texts = {name: [row[at] for row in rows] for at, name in enumerate(("cell_id", "view"))}
     scores = {name: [of.get(name, math.nan) for _, _, of in rows] for name in _SCORES}
     columns = {name: pd.Series(values, dtype=object) for name, values in texts.items()}
-    return pd.DataFrame(columns | {name: np.asarray(of, np.float64) for name, of in scores.items()})
+    columns |= {name: pd.Series(values, dtype=np.float64) for name, values in scores.items()}
+    return pd.DataFrame(columns, copy=False)  # one block a column, whose means sum by rows
 
 
 def _cells(
