@@ -183,7 +183,7 @@ def test_a_missing_render_costs_its_picture_alone(made: Any) -> None:
     page = (report.folder / "table.md").read_text()
     assert "No picture of fern, consistency, seed 0" in page
     assert "fern--consistency.png" not in page
-    assert "+0.40 ↑" in page
+    assert "+0.40 dB ↑" in page
 
 
 def test_baselines_alone_have_values_and_a_failed_scene_its_reason_first(made: Any) -> None:
