@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import functools
+import json
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import pytest
+from omegaconf import OmegaConf
 
+from xrgs.composing import from_dict
 from xrgs.config import CONF_DIR, Conf
 from xrgs.store import identity
 from xrgs.sweep.axes import expand
 
 ABLATIONS = sorted({path.stem for path in (CONF_DIR / "ablation").glob("*.yaml")} - {"baseline"})
+SWEEPS = CONF_DIR / "sweeps" if (CONF_DIR / "sweeps").is_dir() else CONF_DIR.parent / "sweeps"
 STUDY = Path(__file__).parents[1] / "docs" / "study.md"
 #: The ablation that has one of the values of each setting in the table of docs/study.md.
 SENSITIVITY = {
@@ -66,16 +70,30 @@ def test_each_ablation_is_another_cell(name: str, composed: Compose) -> None:
     assert cell_id(ablation) != cell_id(baseline)
     changed = delta(ablation, baseline)
     assert {key.split(".")[0] for key in changed} <= {"components", "splat", "train", "matched_to"}
-
-
-def test_the_ablation_named_baseline_is_the_baseline(composed: Compose) -> None:
-    assert cell_id(composed("+ablation=baseline")) == cell_id(composed())
+    assert from_dict(json.loads(json.dumps(asdict(ablation)))) == ablation
 
 
 def test_no_two_ablations_are_the_same_cell(composed: Compose) -> None:
     confs = [composed(f"+ablation={name}") for name in ABLATIONS]
     # Two controls differ only in the cell whose number of Gaussians they have to reach.
     assert len({(cell_id(conf), conf.matched_to) for conf in confs}) == len(ABLATIONS)
+    assert cell_id(composed("+ablation=baseline")) == cell_id(composed())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("file", sorted(SWEEPS.glob("*.yaml")), ids=lambda file: file.stem)
+def test_each_value_of_a_sweep_file_makes_a_config(file: Path, composed: Compose) -> None:
+    """Each value by itself; tests/cli/test_sweep.py plans whole files."""
+    composed(f"+sweeps={file.stem}")
+    axes = OmegaConf.load(file).hydra.sweeper.params
+    specs = {key: expand([f"{key}={values}"]) for key, values in axes.items()}
+    labels = {spec.label for spec in specs.get("+ablation", ())}
+    for key, of_key in specs.items():
+        for spec in of_key:
+            if key == "matched_to":
+                assert spec.matched_to is None or spec.matched_to in labels
+            else:
+                composed(*spec.overrides)
 
 
 @pytest.mark.parametrize(
@@ -83,9 +101,6 @@ def test_no_two_ablations_are_the_same_cell(composed: Compose) -> None:
     [
         (("loss_weighting", "gradient_scaling"), "loss_gradient"),
         (("loss_weighting", "gradient_scaling", "densify", "consistency"), "xrgs"),
-        (("curriculum", "render_scale"), None),
-        (("loss_weighting", "consistency"), None),
-        (("loss_weighting", "mip"), None),
         (("xrgs", "mip"), None),
         (("densify", "absgrad"), None),
     ],

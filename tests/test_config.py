@@ -8,7 +8,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import MISSING, Field, asdict, dataclass, fields, is_dataclass, replace
+from dataclasses import MISSING, Field, asdict, fields, is_dataclass, replace
 from functools import reduce
 from operator import getitem
 from pathlib import Path
@@ -32,12 +32,8 @@ from xrgs.composing import error_line, escape_interpolations, from_dict, from_fi
 from xrgs.config import (
     CONF_DIR,
     PATHS,
-    ComponentsConf,
     Conf,
-    MipConf,
-    SupersampledConf,
     identity_values,
-    off,
 )
 from xrgs.errors import XrgsError
 from xrgs.splat.settings import DensifySettings, OptimizerSettings, RasterSettings
@@ -179,11 +175,7 @@ def test_every_key_of_the_baseline_has_a_comment() -> None:
         if not above and not re.search(r"  # \S.{9}", lines[line]):
             missing.append(name)
     assert not missing
-
-
-def test_lines_of_the_baseline_fit_a_screen() -> None:
-    lines = (CONF_DIR / "config.yaml").read_text(encoding="utf-8").splitlines()
-    assert max(map(len, lines)) <= 100
+    assert max(map(len, lines)) <= 100, "they fit a screen"
 
 
 def test_only_the_splat_library_has_values_of_its_own() -> None:
@@ -217,14 +209,10 @@ def test_the_splat_librarys_defaults_are_the_baselines(group: str, compose: Comp
     "override",
     [
         "splat.densify.split=middle",
-        "splat.densify.budget=-0.1",
         "splat.densify.budget=nan",
-        "splat.densify.budget=inf",
         "splat.densify.noise=-1",
         "splat.strategy=mc",
-        "splat.init=random",
         "splat.init_scale=0",
-        "splat.init_scale=nan",
     ],
 )
 def test_a_wrong_value_of_densification_is_refused(compose: Compose, override: str) -> None:
@@ -275,37 +263,27 @@ def test_a_value_that_is_missing_is_named(compose: Compose) -> None:
 
 
 @pytest.mark.parametrize(
-    "override",
+    ("override", "wanted"),
     [
-        "splat.optimizer.shN_every=0",
-        "train.steps=0",
-        "threads=-1",
-        "checkpoint_s=-0.5",
-        "limits.minutes=nan",
-        "limits.memory_gb=-1",
+        ("splat.optimizer.shN_every=0", "must be at least"),
+        ("threads=-1", "must be at least"),
+        ("limits.minutes=nan", "must be at least"),
+        ("splat.optimizer.means_decay_from=-1", "must be 0 or more"),
+        ("splat.optimizer.length_decay_from=30000", "must be 0 or more"),
+        ("splat.optimizer.length_power=1.5", "must be from 0 to 1"),
+        ("splat.optimizer.length_power=nan", "must be from 0 to 1"),
+        ("train.validation=1", "must be from 0 to below 1"),
+        ("train.hr_share=-0.1", "must be from 0 to below 1"),
+        ("splat.backend=cuda", "must be one of "),
+        ("retry=all", "must be one of "),
     ],
 )
-def test_a_value_below_its_least_names_its_key(compose: Compose, override: str) -> None:
-    with pytest.raises(XrgsError, match=rf"^{override.partition('=')[0]}=.*: must be at least"):
+def test_a_value_out_of_range_names_its_key(compose: Compose, override: str, wanted: str) -> None:
+    with pytest.raises(XrgsError, match=rf"^{override.partition('=')[0]}=.*: {wanted}"):
         compose(override)
 
 
-@pytest.mark.parametrize("value", [-1, 30_000])
-@pytest.mark.parametrize("key", ["means_decay_from", "length_decay_from"])
-def test_a_decay_begins_within_the_run(compose: Compose, key: str, value: int) -> None:
-    with pytest.raises(XrgsError, match=rf"^splat.optimizer.{key}={value}: must be 0 or more"):
-        compose(f"splat.optimizer.{key}={value}")
-
-
-@pytest.mark.parametrize("power", ["-0.1", "1.5", "nan"])
-def test_the_power_of_a_runs_length_has_a_range(compose: Compose, power: str) -> None:
-    with pytest.raises(XrgsError, match=r"^splat.optimizer.length_power=.*: must be from 0 to 1"):
-        compose(f"splat.optimizer.length_power={power}")
-
-
-@pytest.mark.parametrize(
-    "key", ["seed", "variant.seed", "variant.sfm.seed", "train.steps", "+components.plugins.p.n"]
-)
+@pytest.mark.parametrize("key", ["seed", "variant.sfm.seed", "+components.plugins.p.n"])
 def test_a_number_that_nothing_can_hold_names_its_key(compose: Compose, key: str) -> None:
     with pytest.raises(XrgsError, match=rf"{key.lstrip('+')}=\d+: must be below 2\^(63|31) "):
         compose(f"{key}={2**63}")
@@ -343,23 +321,10 @@ def test_configs_are_composed_in_threads() -> None:
         assert [*pool.map(lambda seed: xrgs.compose(f"seed={seed}").seed, range(4))] == [0, 1, 2, 3]
 
 
-@pytest.mark.parametrize("name", ["validation", "hr_share"])
-@pytest.mark.parametrize("value", ["-0.1", "1", "nan"])
-def test_a_share_of_views_is_from_0_to_below_1(compose: Compose, name: str, value: str) -> None:
-    with pytest.raises(XrgsError, match=rf"^train\.{name}=.*: must be from 0 to below 1"):
-        compose(f"train.{name}={value}")
-    assert getattr(compose(f"train.{name}=0.999").train, name) == 0.999
-
-
-@pytest.mark.parametrize("override", ["splat.backend=cuda", "retry=all"])
-def test_a_value_that_is_no_choice_names_its_key(compose: Compose, override: str) -> None:
-    with pytest.raises(XrgsError, match=f"^{override}: must be one of "):
-        compose(override)
-
-
 def test_values_are_of_their_types_and_interpolations_resolved(compose: Compose) -> None:
     conf = compose("limits.minutes=2", "scene=folder", "scene.path=${data_root}/a", "store=7")
     assert type(conf.limits.minutes) is float
+    assert type(from_dict(asdict(conf) | {"checkpoint_s": 7}).checkpoint_s) is float
     assert conf.scene.path == "data/llff/a"
     assert conf.store == "7"
 
@@ -377,19 +342,18 @@ def test_texts_are_taken_literally(baseline: Conf, text: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("group", ["ablation", "preset", "variant"])
-def test_every_config_is_read_back_from_json(group: str, compose: Compose) -> None:
-    plus = "+" if group == "ablation" else ""
-    for file in sorted((CONF_DIR / group).glob("*.yaml")):
-        conf = compose(f"{plus}{group}={file.stem}")
-        assert from_dict(json.loads(json.dumps(asdict(conf)))) == conf, file
+def test_every_config_is_read_back_from_json(compose: Compose) -> None:
+    """tests/test_ablations.py does so for the ablations."""
+    for group in ("preset", "variant"):
+        for file in sorted((CONF_DIR / group).glob("*.yaml")):
+            conf = compose(f"{group}={file.stem}")
+            assert from_dict(json.loads(json.dumps(asdict(conf)))) == conf, file
 
 
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
         ("train.steps", "many", "train.steps: Expected `int`"),
-        ("train.steps", 1.5, "train.steps: Expected `int`"),
         ("train.validation", True, "train.validation: Expected `float`"),
         ("train.validation", 10**400, "train.validation: "),
         ("variant.test", ["a", 1], "variant.test[1]: Expected `str`"),
@@ -408,21 +372,13 @@ def test_a_wrong_value_is_refused_by_its_key(
         from_dict(values)
 
 
-@pytest.mark.parametrize("key", ["seed", "train.steps", "splat.raster.eps2d", "components"])
+@pytest.mark.parametrize("key", ["train.steps", "components"])
 def test_a_missing_key_is_refused_by_its_name(baseline: Conf, key: str) -> None:
     values = asdict(baseline)
     *groups, name = key.split(".")
     del reduce(getitem, groups, values)[name]
     with pytest.raises(XrgsError, match=rf"^{key}.*: is missing"):
         from_dict(values)
-
-
-def test_whole_numbers_become_floats(baseline: Conf) -> None:
-    values = asdict(baseline)
-    values["train"]["validation"] = 0
-    conf = from_dict(values)
-    assert type(conf.train.validation) is float
-    assert conf == baseline
 
 
 def test_a_file_from_before_a_key_was_added_takes_the_baselines_value(
@@ -514,38 +470,6 @@ def test_an_identity_has_what_is_on(compose: Compose) -> None:
     assert json.loads(json.dumps(raster)) == raster
 
 
-@dataclass(kw_only=True)
-class NewMipConf(MipConf):
-    """A component with a key that was added."""
-
-    added: int = off(3)
-
-
-@dataclass(kw_only=True)
-class NewComponentsConf(ComponentsConf):
-    """The components, and one that was added."""
-
-    mip: NewMipConf
-    added: SupersampledConf
-
-
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(variance=st.sampled_from([0.0, 0.2]), every=st.integers(), late_from=st.integers())
-def test_what_is_added_and_off_changes_no_identity(
-    baseline: Conf, variance: float, every: int, late_from: int
-) -> None:
-    old = replace(baseline.components, mip=MipConf(variance=variance, every=every))
-    new = NewComponentsConf(
-        **vars(old) | {"mip": NewMipConf(**vars(old.mip), added=3)},
-        added=SupersampledConf(factor=1, late_factor=1, late_from=late_from),
-    )
-    assert identity_values(new) == identity_values(old)
-    new.added.factor = 2
-    assert identity_values(new)["added"] == {"factor": 2, "late_from": late_from}
-    new.mip.added = 4
-    assert identity_values(new)["mip"]["added"] == 4
-
-
 @given(text=texts)
 def test_omegaconf_takes_an_escaped_text_literally(text: str) -> None:
     nested = {"a": [text, {"b": text}], "c": 1, "d": None}
@@ -557,10 +481,8 @@ def test_omegaconf_takes_an_escaped_text_literally(text: str) -> None:
     ("content", "named"),
     [
         (b"", r"config\.json: not valid JSON"),
-        (b"[1]", r"config\.json: "),
         (b'{"scene": {"name": 1, "kind": "folder"}}', r"config\.json: scene\.name: Expected"),
         (b'{"bogus": 1}', r"config\.json: bogus: there is no such key.*another version"),
-        (b'{"scene": 3}', r"config\.json: scene: Expected"),
         (b"{}", r"config\.json: scene\.name: is missing"),
     ],
 )

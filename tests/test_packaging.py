@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import tomllib
 from importlib import metadata
@@ -13,6 +14,8 @@ import yaml
 from packaging.version import Version
 
 import xrgs
+from xrgs.config import CONF_DIR
+from xrgs.splat.backend import REQUIRE_NATIVE, resolve_backend
 
 ROOT = Path(__file__).resolve().parents[1]
 PYPROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
@@ -24,28 +27,32 @@ def workflow(name: str) -> dict[str, Any]:
     return loaded
 
 
-def pythons_of_the_workflow() -> list[str]:
-    versions: list[str] = workflow("ci.yml")["jobs"]["test"]["strategy"]["matrix"]["python"]
-    return versions
-
-
-def test_the_classifiers_name_the_pythons_that_the_workflow_tests() -> None:
+def test_the_package_is_for_the_pythons_and_systems_that_the_workflow_tests() -> None:
+    jobs = workflow("ci.yml")["jobs"]
+    pythons = jobs["test"]["strategy"]["matrix"]["python"]
     prefix = "Programming Language :: Python :: 3."
     named = [c.removeprefix(prefix) for c in PROJECT["classifiers"] if c.startswith(prefix)]
-    assert [f"3.{minor}" for minor in named] == pythons_of_the_workflow()
-    assert PROJECT["requires-python"] == f">={pythons_of_the_workflow()[0]}"
-
-
-def test_wheels_are_built_for_the_pythons_that_the_workflow_tests() -> None:
+    assert [f"3.{minor}" for minor in named] == pythons
+    assert PROJECT["requires-python"] == f">={pythons[0]}"
     built = PYPROJECT["tool"]["cibuildwheel"]["build"]
-    assert built == [f"cp{version.replace('.', '')}-*" for version in pythons_of_the_workflow()]
-
-
-def test_the_operating_systems_are_those_of_the_test_jobs() -> None:
-    runners = {job["runs-on"].partition("-")[0] for job in workflow("ci.yml")["jobs"].values()}
+    assert built == [f"cp{version.replace('.', '')}-*" for version in pythons]
     systems = [c for c in PROJECT["classifiers"] if c.startswith("Operating System")]
-    assert runners == {"ubuntu"}
+    assert {job["runs-on"].partition("-")[0] for job in jobs.values()} == {"ubuntu"}
     assert systems == ["Operating System :: POSIX :: Linux"]
+
+
+@pytest.mark.parametrize(("name", "inside"), [("conf", "."), ("sweeps", "sweeps")])
+def test_every_config_file_is_installed(name: str, inside: str) -> None:
+    installed = CONF_DIR / inside if CONF_DIR != ROOT / "conf" else ROOT / name
+    files = sorted(file.relative_to(ROOT / name) for file in (ROOT / name).rglob("*.yaml"))
+    assert len(files) >= 2
+    for file in files:
+        assert (installed / file).read_bytes() == (ROOT / name / file).read_bytes()
+
+
+@pytest.mark.skipif(os.environ.get(REQUIRE_NATIVE) != "1", reason=f"{REQUIRE_NATIVE} is not 1")
+def test_the_native_backend_is_the_one_in_use() -> None:
+    assert resolve_backend("auto") == "native"
 
 
 def test_every_action_is_pinned_to_a_commit() -> None:
@@ -68,12 +75,9 @@ def test_the_version_is_the_same_everywhere() -> None:
         assert citation["version"] == version
 
 
-@pytest.mark.parametrize("name", PROJECT["scripts"])
-def test_every_command_is_installed(name: str) -> None:
-    (command,) = metadata.entry_points(group="console_scripts", name=name)
-    assert command.value == PROJECT["scripts"][name]
-    assert callable(command.load())
-
-
-def test_the_types_are_installed() -> None:
+def test_commands_and_types_are_installed() -> None:
+    for name, value in PROJECT["scripts"].items():
+        (command,) = metadata.entry_points(group="console_scripts", name=name)
+        assert command.value == value
+        assert callable(command.load())
     assert (Path(xrgs.__file__).parent / "py.typed").is_file()

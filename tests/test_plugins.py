@@ -9,7 +9,6 @@ from dataclasses import asdict
 from pathlib import Path
 
 import pytest
-import torch
 
 from tests.conftest import composed as compose
 from xrgs import plugins
@@ -125,7 +124,6 @@ def test_one_name_in_two_packages_is_refused(install: Install) -> None:
         ({"wieght": 1.0}, r"\.wieght: there is no such setting; there are: weight, rounds"),
         ({}, r"\.weight: is missing"),
         ({"weight": "1.0"}, r"\.weight=1\.0: must be of type float"),
-        ({"weight": True}, r"\.weight=True: must be of type float"),
         ({"weight": 1, "rounds": 2.5}, r"\.rounds=2\.5: must be of type int"),
         ({"weight": 13}, r": ValueError: an unlucky number"),
     ],
@@ -142,9 +140,7 @@ def test_a_wrong_setting_names_its_key(
     ("source", "message"),
     [
         ("import no_such_module", "importing one:Plugin failed: ModuleNotFoundError"),
-        ("1 / 0", "importing one:Plugin failed: ZeroDivisionError"),
         ("", "importing one:Plugin failed: AttributeError"),
-        ("Plugin = 3", "entry point one:Plugin must name a subclass"),
         ("class Plugin: pass", "entry point one:Plugin must name a subclass"),
         (
             "from xrgs.training.components import Component as Plugin",
@@ -222,7 +218,6 @@ def test_a_change_of_a_plugin_is_another_cell(
         ("from xrgs.training.components.exposure import Exposure", {"exposure", "adam"}),
         ("from xrgs.training.components import exposure", {"exposure", "adam"}),
         ("import xrgs.training.components.mip as filtered", {"mip"}),
-        ("from xrgs.training.components import Component", set()),
         ("from xrgs.training.components.base import Component", set()),
     ],
 )
@@ -253,36 +248,9 @@ def test_the_built_in_components_that_a_plugin_extends_are_part_of_its_code(
     assert all(edited(copy / f"{name}.py") != before for name in counts)
 
 
-@pytest.mark.parametrize("settings", [None, 0.1, "weight", [1]])
-def test_settings_that_are_no_mapping_are_refused(settings: object, baseline: Conf) -> None:
-    values = asdict(baseline)
-    values["components"]["plugins"] = {"one": settings}
-    with pytest.raises(XrgsError, match=r"^components\.plugins\.one=.*: must be a mapping"):
-        from_dict(values)
-
-
 def test_settings_come_from_the_command_line() -> None:
     conf = compose("+components.plugins.one.weight=0.5", "+components.plugins.one.deep={a: [1, 2]}")
     assert conf.components.plugins == {"one": {"weight": 0.5, "deep": {"a": [1, 2]}}}
     assert from_dict(asdict(conf)) == conf
     with pytest.raises(XrgsError, match=r"^components\.plugins\.one=0\.5: must be a mapping"):
         compose("+components.plugins.one=0.5")
-
-
-def test_a_plugin_may_add_a_term_of_the_gaussians(
-    install: Install, baseline: Conf, data: Dataset
-) -> None:
-    """The loop hands the Gaussians to `modify_loss`, and their gradients reach the optimizer."""
-    from xrgs.training import loop
-
-    source = SOURCE + (
-        "\n    def modify_loss(self, loss, image, gaussians, step):"
-        "\n        return loss + self.settings.weight * gaussians.opacities.sigmoid().mean()\n"
-    )
-    install("dist", {"one": "one:Plugin"}, {"one.py": source})
-    baseline.splat.backend, baseline.train.steps = "auto", 10
-    plain = loop.train(data, baseline).gaussians
-    baseline.components.plugins = {"one": {"weight": 10.0}}
-    regularised = loop.train(data, baseline).gaussians
-    means = [torch.sigmoid(gaussians.opacities).mean() for gaussians in (plain, regularised)]
-    assert means[1] < 0.9 * means[0]

@@ -91,9 +91,6 @@ def _own_hydra() -> Iterator[ModuleType]:
 def to_conf(cfg: DictConfig) -> Conf:
     """Convert a config from Hydra to a `Conf`, and check ranges and choices.
 
-    Args:
-        cfg: A config composed from `conf/config.yaml`, whose defaults contain the schema.
-
     Returns:
         The config, with resolved interpolations.
 
@@ -116,7 +113,6 @@ def to_conf(cfg: DictConfig) -> Conf:
     _expand_home(conf)
     _check_ranges(conf)
     _check_optimizer(conf.splat.optimizer)
-    _check_sfm_seed(conf)
     _check_choices(conf)
     _check_strategy(conf)
     return conf
@@ -158,6 +154,10 @@ def _check_ranges(conf: Conf) -> None:
     for key, value, least in least_values:
         if not value >= least:
             raise XrgsError(f"{key}={value}: must be at least {least}")
+    if (seed := conf.variant.sfm.seed) >= 2**31:
+        raise XrgsError(
+            f"variant.sfm.seed={seed}: must be below 2^31 = {2**31}, as COLMAP holds it"
+        )
     for name in ("validation", "hr_share"):
         if not 0 <= (share := getattr(conf.train, name)) < 1:
             raise XrgsError(f"train.{name}={share}: must be from 0 to below 1")
@@ -179,14 +179,6 @@ def _check_optimizer(optimizer: OptimizerSettings) -> None:
             )
     if not 0 <= (power := optimizer.length_power) <= 1:
         raise XrgsError(f"splat.optimizer.length_power={power}: must be from 0 to 1")
-
-
-def _check_sfm_seed(conf: Conf) -> None:
-    """Raise `XrgsError` if the seed of SfM is too large for COLMAP."""
-    if (seed := conf.variant.sfm.seed) >= 2**31:
-        raise XrgsError(
-            f"variant.sfm.seed={seed}: must be below 2^31 = {2**31}, as COLMAP holds it"
-        )
 
 
 def _check_choices(conf: Conf) -> None:
@@ -246,9 +238,6 @@ def from_dict(values: Any) -> Conf:
 
     Interpolations are not resolved: a path may contain `${`, and a file of unknown origin must not
     read this process's environment.
-
-    Args:
-        values: Nested dicts of plain values, with every key.
 
     Raises:
         XrgsError: A key is unknown or missing, or a value is of the wrong type; the message names
@@ -317,9 +306,6 @@ def from_file(file: Path) -> tuple[Conf, dict[str, Any]]:
     means "off". Settings of components that have moved to `examples/arms` become those of the
     plugin, if the component was on.
 
-    Args:
-        file: The JSON file.
-
     Returns:
         The config, and missing key -> value that was inserted.
 
@@ -373,9 +359,6 @@ def _baseline() -> Any:
 
 def error_line(error: Exception) -> str:
     """Return the first line of an error's message, with the config's key.
-
-    Args:
-        error: Any exception. OmegaConf's exceptions have a key, which the message may lack.
 
     Returns:
         One line, prefixed with the key if the message does not contain it.

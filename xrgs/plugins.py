@@ -44,9 +44,6 @@ def installed() -> list[str]:
 def find(name: str) -> EntryPoint:
     """Find the entry point of a plugin, without importing its package.
 
-    Args:
-        name: The name of the plugin, its key under `components.plugins`.
-
     Returns:
         The entry point; its value is `package.module:Class`.
 
@@ -99,9 +96,6 @@ def code_digest(name: str, folders: CodeFolders) -> str:
 
 def load(name: str) -> object:
     """Import a plugin's package and return the object of its entry point.
-
-    Args:
-        name: The name of the plugin.
 
     Returns:
         The object; the caller checks its type.

@@ -45,26 +45,16 @@ def test_doubles_and_whole_numbers_are_read_too(load: Load, file: Path) -> None:
     assert torch.equal(again.means, load.means)
 
 
-@pytest.mark.parametrize("key", ["means", "sh", "viewmat", "height"])
-def test_a_missing_key_is_named(file: Path, key: str) -> None:
-    rewritten(file, **{key: None})
-    with pytest.raises(XrgsError, match=rf"load\.npz: .*\b{key}\b"):
-        loads.read(file)
-
-
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
+        ("means", None, r".*\bmeans\b"),
         ("means", np.zeros((150, 2)), r"means must be \['N', 3\], got \[150, 2\]"),
-        ("quats", np.zeros((149, 4)), r"quats must be \['N', 4\], got \[149, 4\]"),
         ("sh", np.zeros((150, 9, 3)), r"sh must be \['N', 16, 3\], got \[150, 9, 3\]"),
-        ("viewmat", np.eye(3), r"viewmat must be \[4, 4\], got \[3, 3\]"),
         ("width", np.array([40]), r"width must be \[\], got \[1\]"),
         ("width", np.array(10), "width and height must be at least 11, got 10x30"),
         ("means", np.full((150, 3), np.nan), "means must be finite"),
-        ("K", np.full((3, 3), np.inf), "K must be finite"),
         ("scales", np.full((150, 3), -1.0), "scales must be at least 0"),
-        ("opacities", np.full(150, 1.5), "opacities must be at most 1"),
         ("means", np.full((150, 3), True), "means must be numbers"),
         ("means", np.full((150, 3), "x"), "cannot be read as .npz: means.npy: its header"),
         ("viewmat", 2 * np.eye(4), "viewmat must be a rotation"),
@@ -79,20 +69,11 @@ def test_wrong_values_are_named(file: Path, key: str, value: object, message: st
 def test_what_is_no_npz_is_refused(tmp_path: Path) -> None:
     with pytest.raises(XrgsError, match=r"none\.npz: cannot be read"):
         loads.read(tmp_path / "none.npz")
-    for content in (b"", b"PK\x03\x04 and no more", b"text"):
+    np.save(tmp_path / "array.npy", np.zeros(3))
+    for content in (b"", b"PK\x03\x04 and no more", (tmp_path / "array.npy").read_bytes()):
         (tmp_path / "bad.npz").write_bytes(content)
         with pytest.raises(XrgsError, match=r"bad\.npz: cannot be read as \.npz"):
             loads.read(tmp_path / "bad.npz")
-    np.save(tmp_path / "array.npy", np.zeros(3))
-    (tmp_path / "array.npy").rename(tmp_path / "array.npz")
-    with pytest.raises(XrgsError, match=r"array\.npz: cannot be read as \.npz"):
-        loads.read(tmp_path / "array.npz")
-
-
-def test_the_seed_decides_a_random_load() -> None:
-    first, again, other = (loads.random_load(50, 40, 30, seed) for seed in (1, 1, 2))
-    assert torch.equal(first.means, again.means)
-    assert not torch.equal(first.means, other.means)
 
 
 @pytest.mark.parametrize("count", [300, 3000])
@@ -120,11 +101,12 @@ def test_a_smaller_view_shows_the_same(load: Load) -> None:
     torch.testing.assert_close(small.camera.K @ corner, torch.tensor([20.0, 15.0, 1.0]))
 
 
-def test_larger_gaussians_overlap_more() -> None:
-    usual = loads.random_load(50, 40, 30, seed=0)
+def test_the_seed_decides_a_random_load_and_larger_gaussians_overlap_more() -> None:
+    usual, other = (loads.random_load(50, 40, 30, seed) for seed in (0, 1))
     larger = loads.random_load(50, 40, 30, 0, size_per_spacing=3.0)
     np.testing.assert_allclose(larger.scales, 2 * usual.scales, rtol=1e-6)
     np.testing.assert_array_equal(larger.means, usual.means)
+    assert not torch.equal(usual.means, other.means)
 
 
 @pytest.mark.slow

@@ -76,13 +76,11 @@ def test_one_panel_answers_each_question(results: dict[str, Any]) -> None:
     assert starts == [0, 0, 1, 1, 3, 3, 6, 6, 10, 10]
 
 
-def test_a_single_load_shows_no_growth(results: dict[str, Any]) -> None:
+def test_a_single_load_shows_no_growth_and_gives_the_same_png_each_time(
+    results: dict[str, Any],
+) -> None:
     results["rows"], results["growth"] = results["rows"][:8], []
     assert len(plot.draw_figure(results).axes) == 4
-
-
-@pytest.mark.slow
-def test_a_plot_is_a_png_and_the_same_each_time(results: dict[str, Any]) -> None:
     drawn = plot.draw(results)
     assert drawn.startswith(b"\x89PNG")
     assert drawn == plot.draw(results)

@@ -1,10 +1,7 @@
-"""The training step that the benchmark measures, its shortcuts and its memory."""
+"""The training step that the benchmark measures, and its shortcuts."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import pytest
 import torch
 
 from xrgs.bench import training
@@ -38,14 +35,3 @@ def test_the_optimizer_leaves_zero_moments_alone(load: Load) -> None:
         before = step.gaussians.shN.detach().clone()
         step.optimize()
         assert torch.equal(step.gaussians.shN, before) != moves
-
-
-@pytest.mark.slow
-def test_a_process_grows_by_the_counted_bytes_and_not_by_the_imports() -> None:
-    row = training.measure_memory(BACKEND, 20_000, 64, 48, threads=1)
-    assert (row["gaussians"], row["width"], row["height"]) == (20_000, 64, 48)
-    model = 4 * 20_000 * (3 + 4 + 3 + 1 + 48) / 2**20
-    assert row["counted_mib"] > 4 * model  # parameters, gradients, two moments
-    if Path("/proc/self/status").exists():
-        assert row["base_rss_mib"] > 50  # torch alone
-        assert row["growth_mib"] == row["peak_rss_mib"] - row["base_rss_mib"] > 3 * model

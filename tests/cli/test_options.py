@@ -61,24 +61,21 @@ def test_help_has_what_is_said_of_an_option_without_the_breaks_of_its_lines(
     assert "all frames have the focal length of the first test view." in line
 
 
-@pytest.mark.parametrize("command", ["sweep", *COMMANDS])
-def test_every_command_says_the_version_of_xrgs(call_command: RunCommand, command: str) -> None:
-    found = call_command(command, "--version")
-    assert found == (0, f"xrgs-{command} {xrgs.__version__}\n", "")
+def test_every_command_says_the_version_of_xrgs(call_command: RunCommand) -> None:
+    for command in ("sweep", *COMMANDS):
+        found = call_command(command, "--version")
+        assert found == (0, f"xrgs-{command} {xrgs.__version__}\n", "")
 
 
 @pytest.mark.parametrize(
     ("words", "options"),
     [
-        ("report out=FOLDER", "report --out FOLDER"),
         ("report store=s scenes=a,b", "report --store s --scenes a b"),
         ("report store=a,b", "report --store a,b"),  # there is a folder of that name
         ("store rm dry_run=true", "store rm --dry-run"),
         ("store rm scenes=a 0123 yes=false store=gone", "store rm 0123 --scenes a --store gone"),
         ("data export 0123 format=colmap", "data export 0123 --format colmap"),
-        ("data inspect scene=video out=a.png", "data inspect scene=video --out a.png"),
         ("bench against=PYTHON repeats=0", "bench --against PYTHON --repeats 0"),
-        ("status stroe=s", "status --stroe s"),
     ],
 )
 def test_options_are_taken_in_hydra_s_syntax_too(
@@ -112,20 +109,13 @@ def test_a_value_behind_an_option_may_have_an_equals_sign(
     ("words", "named"),
     [
         ("status --stroe s", "--stroe"),
-        ("status s", "Unrecognized options: s"),
         ("report --aginst x", "--against LABEL"),
         ("store", "Missing subcommand"),
         ("store remove", "Available subcommands: list, show, rm"),
-        ("store list --sort weight", "'name', 'age', 'size'"),
-        ("store gc abc", "Unrecognized options: abc"),
         ("store show", "CELL"),
-        ("store pack", "--out"),
         ("data download", "{llff}"),
-        ("data download mnist", "'llff'"),
         ("data export a --format obj", "'colmap', 'nerfstudio'"),
-        ("render abc --views many", "--views"),
         ("render abc --size 504", "--size"),
-        ("bench --repeats many", "--repeats"),
     ],
 )
 def test_wrong_usage_is_named_and_ends_with_2(
@@ -145,9 +135,6 @@ def test_wrong_usage_is_named_and_ends_with_2(
         ("render", "give one cell or 2"),
         ("render abc", "--store xrgs-store is not a store"),
         ("report --store gone", "--store gone is not a store"),
-        ("report list --store gone", "--store gone is not a store"),
-        ("status --store gone", "--store gone is not a store"),
-        ("view", "give one cell or 2"),
         ("view abc --limit 0", "--limit 0: must be at least 1"),
         ("view gone.ply", "gone.ply: cannot be read"),
     ],
@@ -161,13 +148,10 @@ def test_an_error_is_a_message_and_ends_with_1(
     assert err.startswith(f"xrgs-{command}: {message}")
 
 
-def test_an_error_is_one_line() -> None:
+def test_an_error_is_one_line_and_no_other_exception_is_hidden() -> None:
     with pytest.raises(SystemExit) as end, errors_as_messages("xrgs-x"):
         raise XrgsError("two\nlines")
     assert end.value.code == "xrgs-x: two lines"
-
-
-def test_other_errors_are_not_hidden() -> None:
     with pytest.raises(ZeroDivisionError), errors_as_messages("xrgs-x"):
         raise ZeroDivisionError
 
@@ -177,30 +161,24 @@ def test_the_paths_of_a_film_can_all_be_chosen() -> None:
     assert (get_args(names), none) == (tuple(PATHS), type(None))
 
 
-@pytest.mark.parametrize(
-    ("line", "wanted"),
-    [("xrgs-store t", "trim"), ("xrgs-store list --so", "--sort"), ("xrgs-store rm --y", "--yes")],
-)
-def test_bash_completes_a_command(
-    call_command: RunCommand, tmp_path: Path, line: str, wanted: str
-) -> None:
+def test_bash_completes_a_command(call_command: RunCommand, tmp_path: Path) -> None:
     if (bash := shutil.which("bash")) is None:
         pytest.skip("there is no bash")
     assert call_command("store", "--tyro-write-completion", "bash", "completion")[0] == 0
-    script = (
-        "source completion; function=$(complete -p xrgs-store | cut -d' ' -f3);"
-        f"COMP_WORDS=({line}); COMP_CWORD={len(line.split()) - 1}; $function; echo $COMPREPLY"
-    )
-    done = subprocess.run([bash, "-c", script], cwd=tmp_path, capture_output=True, check=True)
-    assert done.stdout.decode().split() == [wanted]
+    for line, wanted in (("xrgs-store t", "trim"), ("xrgs-store list --so", "--sort")):
+        script = (
+            "source completion; function=$(complete -p xrgs-store | cut -d' ' -f3);"
+            f"COMP_WORDS=({line}); COMP_CWORD={len(line.split()) - 1}; $function; echo $COMPREPLY"
+        )
+        done = subprocess.run([bash, "-c", script], cwd=tmp_path, capture_output=True, check=True)
+        assert done.stdout.decode().split() == [wanted]
 
 
-@pytest.mark.parametrize("word", ["--store=~/s", "store=~/s"])
-@pytest.mark.parametrize("command", ["status", "report", "store list"])
+@pytest.mark.parametrize("words", ["status --store=~/s", "store list store=~/s"])
 def test_the_home_folder_of_every_option_is_expanded(
-    call_command: RunCommand, monkeypatch: pytest.MonkeyPatch, word: str, command: str
+    call_command: RunCommand, monkeypatch: pytest.MonkeyPatch, words: str
 ) -> None:
     monkeypatch.setenv("HOME", "/nowhere")
-    _, out, err = call_command(*command.split(), word)
+    _, out, err = call_command(*words.split())
     assert "/nowhere/s" in out + err
     assert "~" not in out + err

@@ -25,9 +25,8 @@ RunCommand = Callable[..., tuple[int, str, str]]
 ACCENT = "e\N{COMBINING ACUTE ACCENT}"
 WHOLE = "\N{LATIN SMALL LETTER E WITH ACUTE}"
 ODD = (
-    *("a b", " lead", "trail ", "-x", "~nobody", "50%", "a=b", "it's", 'q"q', "a;b", "a&b", "#h"),
-    *("!x", "[x]", "{y}", "(p)", "$x", "a:b", "*", ACCENT, WHOLE, "部屋", "🙂", "1e3", "true"),
-    *("007", "a\\b'"),
+    *("a b", " lead", "trail ", "-x", "~nobody", "50%", "a=b", "it's", 'q"q', "#h", "!x", "[x]"),
+    *("{y}", "(p)", "$x", "a:b", "*", ACCENT, WHOLE, "🙂", "1e3", "true", "007", "a\\b'"),
 )
 
 
@@ -44,7 +43,7 @@ def test_hydra_reads_a_path_as_it_was_written(name: str) -> None:
     assert texts([f"store={name}"]).store == name
 
 
-@pytest.mark.parametrize("name", ["a,b", "null", "${y}", "a\\b", f"{WHOLE},b"])
+@pytest.mark.parametrize("name", ["a,b", "null", "${y}"])
 def test_a_word_that_hydra_reads_otherwise_is_a_path_if_it_exists(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compose: Callable[..., config.Conf]
 ) -> None:
@@ -53,20 +52,21 @@ def test_a_word_that_hydra_reads_otherwise_is_a_path_if_it_exists(
     assert compose(*with_quotes([f"scene.path={name}"])).scene.path == name
 
 
-@pytest.mark.parametrize("name", [*ODD, "100_7100", "null", "it's, that's", "${y}", "IMG(1)", "+p"])
-def test_names_of_views_are_read_as_they_were_written(
+@pytest.mark.parametrize("name", [*ODD, "100_7100", "null", "${y}", "IMG(1)", "+p"])
+def test_names_of_views_are_read_as_they_were_written(name: str) -> None:
+    name = name.strip()
+    escaped = name.replace("${", r"\${")
+    assert parsed(f"variant.test=[IMG_1, {name}]") == ["IMG_1", escaped]
+    assert parsed(f"variant.test=IMG_1,{name}") == ["IMG_1", escaped]
+
+
+@pytest.mark.parametrize("name", ["it's, that's", "${y}", "null"])
+def test_names_are_in_a_config_as_they_were_written(
     name: str, compose: Callable[..., config.Conf]
 ) -> None:
-    name = name.strip()
-    if "," in name:
-        assert compose(*with_quotes([f"scene.name={name}"])).scene.name == name
-        return
-    conf = compose(*with_quotes([f"scene.name={name}", f"variant.test=[IMG_1, {name}]"]))
-    assert conf.scene.name == name
-    assert conf.variant.test == ["IMG_1", name]
-    escaped = name.replace("${", r"\${")
-    assert parsed(f"variant.test=[{name}]") == [escaped]
-    assert parsed(f"variant.test=IMG_1,{name}") == ["IMG_1", escaped]
+    assert compose(*with_quotes([f"scene.name={name}"])).scene.name == name
+    if "," not in name:
+        assert compose(*with_quotes([f"variant.test=[{name}]"])).variant.test == [name]
 
 
 @pytest.mark.parametrize(
@@ -76,7 +76,6 @@ def test_names_of_views_are_read_as_they_were_written(
         ("[a,b],[c]", [["a", "b"], ["c"]]),
         ("['a,b',\"c\"]", [["a,b", "c"]]),
         ("[IMG(1,2),x]", [["IMG(1,2)", "x"]]),
-        ("[IMG[1,x]", [["IMG[1", "x"]]),
         ("[it's,that's]", [["it's", "that's"]]),
     ],
 )
@@ -97,20 +96,15 @@ def test_files_of_groups_may_have_any_name(tmp_path: Path, sweep_here: RunComman
     assert "plan: 2 cells" in err
 
 
-def test_a_folder_in_place_of_a_scene_is_answered_with_the_words_to_type(
-    tmp_path: Path, sweep_here: RunCommand
-) -> None:
-    (tmp_path / "my photos").mkdir()
-    code, _, err = sweep_here(f"scene={tmp_path}/my photos", "dry_run=true")
-    assert code == 1
-    assert f"is given as scene=folder 'scene.path={tmp_path}/my photos'" in err
-
-
-def test_lists_quotes_and_other_keys_stay_as_they_are() -> None:
+def test_lists_quotes_and_other_keys_stay_as_they_are(tmp_path: Path) -> None:
     words = ["scene.path=a,b", "scene.path='é'", "seed=range(0,9)", "label=é", "+ablation=[a,b]"]
     assert with_quotes(words) == words
     assert with_quotes(["scene.path=é,b c"]) == ["scene.path='é',b c"]
-    assert with_quotes(["store=é,b c"]) == ["store='é,b c'"]
+    (tmp_path / "a, b").mkdir()
+    (override,) = with_quotes([f"scene.path={tmp_path}/a, b/**"])
+    assert override == f"scene.path='{tmp_path}/a, b/**'"
+    with pytest.raises(XrgsError, match=r"store=\\udcff.*not valid Unicode"):
+        with_quotes(["store=\udcff"])
 
 
 @pytest.mark.parametrize(
@@ -118,14 +112,10 @@ def test_lists_quotes_and_other_keys_stay_as_they_are() -> None:
     [
         ("seed=0,1", "--multirun seed=0,1"),
         ("seed=0 -m +ablation=mip", "--multirun seed=0 +ablation=mip"),
-        ("seed=0 --multirun", "--multirun seed=0"),
         ("seed=0 --config-dir my ~x", "--config-dir my --multirun seed=0 ~x"),
-        ("seed=0 -cd=my=1 scene=a", "-cd my=1 --multirun seed=0 scene=a"),
         ("seed=0 --cfg job threads=1", "--cfg job seed=0 threads=1"),
         ("-m -c job --resolve seed=0", "-c job --resolve seed=0"),
         ("seed=0 --info", "--info all seed=0"),
-        ("--info seed=0", "--info all seed=0"),
-        ("-i plugins seed=0", "-i plugins seed=0"),
         ("seed=0 hydra.mode=RUN", "seed=0 hydra.mode=RUN"),
         ("--config-dir ~/my", "--config-dir /home/me/my --multirun"),
     ],
@@ -145,14 +135,12 @@ def test_files_of_groups_may_have_names_that_yaml_reads_as_numbers(name: str) ->
     assert [first.label, second.label] == [name, "mip"]
 
 
-@pytest.mark.parametrize("axis", ["seed=0,1", "+ablation=mip,lean"])
 @pytest.mark.parametrize(
-    ("wrong", "named"),
+    ("axis", "wrong", "named"),
     [
-        ("steps=100", "did you mean train.steps"),
-        ("limits.minutes=1h", "limits.minutes"),
-        ("variant=bx", "did you mean box"),
-        ("store=a seed=[1", "seed=[1"),
+        ("seed=0,1", "limits.minutes=1h", "limits.minutes"),
+        ("+ablation=mip,lean", "variant=bx", "did you mean box"),
+        ("seed=0,1", "store=a seed=[1", "seed=[1"),
     ],
 )
 def test_a_mistake_beside_an_axis_is_named_and_not_the_axis(
@@ -171,14 +159,11 @@ HEAD = "# @package _global_\n"
     ("content", "named"),
     [
         ("components: {mip: {every: 3}}", "ablation/mine.yaml: its first line must be `# @package"),
-        ("# @package _globl_\nseed: 1", "ablation/mine.yaml: its first line must be `# @package"),
         (HEAD + "components: {mip: {evry: 3}}", "ablation/mine.yaml: components.mip.evry"),
         (HEAD + "component: {mip: {every: 3}}", "'component' not in 'Conf'; did you mean compon"),
         (HEAD + "components: {mip: {every: x}}", "components.mip.every: Value 'x' of type 'str'"),
-        (HEAD + "components: {3: 4}", "ablation/mine.yaml: components.3"),
         (HEAD + "components: {plugins: {3: {}}}", "components.plugins.3: Key 3 (int)"),
         (HEAD + "seed: [", "a YAML file of the config can't be read: .*mine.yaml"),
-        (HEAD + "seed: 1\nseed: 2", "found duplicate key seed"),
         (HEAD + "seed: \udcff", "a YAML file of the config can't be read"),
     ],
 )
@@ -192,29 +177,20 @@ def test_a_mistake_in_a_file_of_the_users_own_is_named(
     assert re.search(re.escape(named).replace(r"\.\*", ".*"), err), err
 
 
-def test_an_axis_of_the_sweepers_own_settings_is_planned(sweep_here: RunCommand) -> None:
-    code, _, err = sweep_here(
-        "scene=motorcycle",
-        "variant.test_every=0",
-        '+hydra.sweeper.params.seed="0,1"',
-        "dry_run=true",
-    )
-    assert (code, "plan: 2 cells" in err) == (0, True)
-
-
-def test_a_glob_is_every_file_of_its_group_of_that_name(sweep_here: RunCommand) -> None:
-    _, _, err = sweep_here("scene=motorcycle", "+ablation=glob(near*)", "dry_run=true")
-    assert "plan: 2 cells" in err
-    assert "/ near_limit /" in err
-
-
-@pytest.mark.parametrize("name", sorted(ARMS))
-def test_an_arm_that_was_moved_out_is_named_with_its_package(
-    name: str, sweep_here: RunCommand
+def test_an_axis_of_the_sweepers_own_settings_and_a_glob_are_planned(
+    sweep_here: RunCommand,
 ) -> None:
-    code, _, err = sweep_here("scene=motorcycle", f"+ablation=[keep_large,{name}]", "dry_run=true")
+    own = '+hydra.sweeper.params.seed="0,1"'
+    glob = "+ablation=glob(near*)"  # every file of its group of that name
+    code, _, err = sweep_here("scene=motorcycle", "variant.test_every=0", own, glob, "dry_run=true")
+    assert (code, "plan: 4 cells" in err, "/ near_limit /" in err) == (0, True, True)
+
+
+def test_an_arm_that_was_moved_out_is_named_with_its_package(sweep_here: RunCommand) -> None:
+    arm = min(ARMS)
+    code, _, err = sweep_here(f"+ablation=[keep_large,{arm}]", "dry_run=true")
     assert code == 1
-    assert f"ablation={name}: it is in a package of its own: pip install ./examples/arms" in err
+    assert f"ablation={arm}: it is in a package of its own: pip install ./examples/arms" in err
 
 
 def test_the_home_folder_of_a_store_is_not_a_folder_called_tilde(
@@ -225,17 +201,6 @@ def test_the_home_folder_of_a_store_is_not_a_folder_called_tilde(
     sweep_here("scene=motorcycle", "preset=smoke", "+ablation=baseline", "store=~/s")
     assert (tmp_path / "home/s/cells").is_dir()
     assert not (tmp_path / "~").exists()
-
-
-def test_bytes_that_are_not_unicode_are_named() -> None:
-    with pytest.raises(XrgsError, match=r"store=\\udcff.*not valid Unicode"):
-        with_quotes(["store=\udcff"])
-
-
-def test_a_path_with_commas_may_end_with_all_folders_below(tmp_path: Path) -> None:
-    (tmp_path / "a, b").mkdir()
-    (override,) = with_quotes([f"scene.path={tmp_path}/a, b/**"])
-    assert override == f"scene.path='{tmp_path}/a, b/**'"
 
 
 @pytest.mark.slow
@@ -268,11 +233,18 @@ def test_a_scene_with_odd_names_is_swept_and_reported(
     assert scene.name in out
 
 
-def test_help_names_every_choice(sweep_here: RunCommand) -> None:
+def test_help_and_a_sweep_with_nothing_say_what_to_type(
+    sweep_here: RunCommand, tmp_path: Path
+) -> None:
     code, out, _ = sweep_here("--help")
     assert code == 0
     for name in ("consistency", "llff/fern", "motorcycle", "laptop", "smoke"):
         assert name in out
+    code, out, err = sweep_here()
+    assert (code, out) == (2, "")
+    assert "xrgs-train FOLDER" in err
+    assert "xrgs-sweep +ablation=consistency" in err
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("kind", [HydraException, ConfigKeyError])
@@ -285,29 +257,20 @@ def test_an_error_of_hydra_is_one_line_with_a_hint(kind: type[Exception]) -> Non
     ("words", "message"),
     [
         (["scene=fern"], "scene=fern: there is no such choice; did you mean llff/fern?"),
-        (["scene=q"], "choose from: captures/bonsai, captures/monstree, captures/ollie"),
-        (["steps=100"], "steps: there is no such key; did you mean train.steps"),
         (["+steps=100"], "steps: there is no such key; did you mean train.steps"),
-        (["+train.stesp=4"], "train.stesp: there is no such key; did you mean train.steps?"),
         (["ablaton=consistency"], "ablaton: there is no such key; did you mean ablation?"),
         (["+ablation=consistancy"], "did you mean consistency?"),
-        (["sweeps=tabel1"], "sweeps=tabel1: there is no such choice; did you mean table1?"),
-        (["hydra/launcher=jobli"], "hydra/launcher=jobli: there is no such choice"),
-        (["dry_run=maybe"], "dry_run: Value 'maybe' is not a valid bool"),
         (["seed=["], "seed=[: "),
         (["garden"], "garden: to train on these photographs, type: xrgs-train garden"),
         (["plus"], "plus: an ablation is given as +ablation=plus"),
         (["fern"], "fern: a scene is given as scene=llff/fern"),
+        (["scene=./my photos"], "is given as scene=folder 'scene.path=./my photos'"),
         (["nothing"], "nothing: write KEY=VALUE"),
         (["=5"], "=5: write KEY=VALUE"),
-        (["+=5"], "+=5: write KEY=VALUE"),
         (["--seed", "3"], "--seed: there is no such option; write seed=3"),
-        (["--store=s"], "--store=s: there is no such option; write store=s"),
         (["--fail-fast"], "--fail-fast: there is no such option; write fail_fast=true"),
-        (["--scene", "garden"], "--scene: there is no such option; write scene=garden"),
         (["--minutes", "3"], "--minutes: there is no such option; see xrgs-sweep --help"),
         (["+ablation=a,", "b"], "write it without the space: +ablation=a,b"),
-        (["seed=0", ",1"], "write it without the space: seed=0,1"),
         (["+ablation=[a,", "b]"], "write it without the space: '+ablation=[a,b]'"),
         (["+ablation=qqqq"], "there is no such choice; xrgs-sweep --help lists all "),
     ],
@@ -316,8 +279,9 @@ def test_an_error_of_hydra_is_one_line_with_a_hint(kind: type[Exception]) -> Non
 def test_a_typo_is_one_line_with_what_was_meant(
     sweep_here: RunCommand, tmp_path: Path, words: list[str], message: str
 ) -> None:
-    (tmp_path / "garden").mkdir()
-    code, out, err = sweep_here(*words, *[] if "dry_run" in words[0] else ["dry_run=true"])
+    for name in ("garden", "my photos"):
+        (tmp_path / name).mkdir()
+    code, out, err = sweep_here(*words, "dry_run=true")
     assert (code, out) == (1, "")
     assert err.startswith("xrgs-sweep: ")
     assert message in err
@@ -329,19 +293,14 @@ def test_a_typo_is_one_line_with_what_was_meant(
     ("word", "meant"),
     [
         ("train.steps=100,", "train.steps=100"),
-        ("train.steps=,100", "train.steps=100"),
         ("train.steps=100,,200", "train.steps=100,200"),
-        ("seed=range(0,3,)", "'seed=range(0,3)'"),
         ("+ablation=[a,,b]", "'+ablation=[a,b]'"),
         ("train.steps==100", "train.steps=100"),
         ("train.steps=choice(100", "'train.steps=choice(100)'"),
-        ("seed=sort(range(3)", "'seed=sort(range(3))'"),
-        ("variant.sfm.poses=[0,1", "'variant.sfm.poses=[0,1]'"),
         ("components.consistency={weight:0.3", "'components.consistency={weight:0.3}'"),
         ("train.steps=(100,200)", "train.steps=100,200"),
         ("train.steps=choice(range(100,300,100))", "'train.steps=range(100,300,100)'"),
         ("seed=sort(choice(range(3)))", "'seed=sort(range(3))'"),
-        ("seed=choice(choice(1,2))", "'seed=choice(1,2)'"),
     ],
 )
 def test_an_override_that_hydra_s_grammar_refuses_is_answered_with_the_words_to_type(
@@ -360,12 +319,8 @@ def test_an_override_that_hydra_s_grammar_refuses_is_answered_with_the_words_to_
         ("train.steps=100;200", "several values are written as train.steps=1,2,3 or"),
         ("seed=foo(1,2)", "can't be read"),
         ("seed=range(a,b)", "can't be read"),
-        ("seed=range(1,2,3,4)", "can't be read"),
         ("scene.name='a", "can't be read"),
-        ("seed=a)", "can't be read"),
         ("train.steps=range(100,30000)", "this range has 29900 values, 10000 can be: give a step"),
-        ("seed=range(0,1,1e-9)", "this range has 1000000000 values"),
-        ("seed=range(0,-1e9,-1)", "this range has 1000000000 values"),
         ("seed=range(0,3,0)", "the step of a range must not be 0"),
         ("seed=choice()", "empty choice is not legal"),
     ],
@@ -377,23 +332,13 @@ def test_no_message_has_the_words_of_a_parser(word: str, said: str) -> None:
     assert not re.search("expecting|viable|argument|Exception|Error|Sweep", str(refused.value))
 
 
-def test_a_sweep_with_nothing_says_what_to_type(sweep_here: RunCommand, tmp_path: Path) -> None:
-    code, out, err = sweep_here()
-    assert (code, out) == (2, "")
-    assert "xrgs-train FOLDER" in err
-    assert "xrgs-sweep +ablation=consistency" in err
-    assert not list(tmp_path.iterdir())
-
-
 @pytest.mark.parametrize(
     ("word", "read"),
     [
         ("train.steps=3e3", "train.steps=3000"),
         ("train.steps=1e2,2.0,5", "train.steps=100,2,5"),
-        ("seed=1E1", "seed=10"),
         ("variant.long_side=504.0", "variant.long_side=504"),
         ("train.steps=1.5", "train.steps=1.5"),  # refused by its type
-        ("train.steps=range(0,9)", "train.steps=range(0,9)"),
         ("train.validation=3e-1", "train.validation=3e-1"),  # no whole number
         ("scene.path=1e3", "scene.path='1e3'"),
     ],

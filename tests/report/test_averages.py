@@ -34,22 +34,6 @@ def test_scenes_are_counted_by_the_sign_of_their_mean(made: Any) -> None:
     assert tuple(same[["up", "down", "n", "p_sign"]]) == (0, 0, 4, 1.0)
 
 
-def test_the_signs_of_a_single_scene_are_of_its_replicates(made: Any) -> None:
-    for seed, factor in enumerate((1.1, 1.2, 0.9)):
-        made.add(seed=seed)
-        made.add("consistency", seed=seed, factors={"psnr": factor})
-    row = mean_of(compared(made), "psnr")
-    assert tuple(row[["up", "down", "n", "unit"]]) == (2, 1, 3, "replicates")
-
-
-def test_a_pair_without_a_change_does_not_count(made: Any) -> None:
-    for seed, lpips in enumerate((None, 0.25)):
-        made.add(seed=seed, values={"lpips": lpips})
-        made.add("consistency", seed=seed, factors={"psnr": 1.1})
-    row = mean_of(compared(made), "lpips")
-    assert tuple(row[["up", "down", "n", "pairs"]]) == (0, 0, 1, 1)
-
-
 def add_nested(made: Any, changes: dict[str, tuple[float, ...]], metric: str = "psnr") -> None:
     """Pairs of each scene: dB of PSNR, or logarithms times 100 of an amount."""
     for scene, of_scene in changes.items():
@@ -74,33 +58,16 @@ def test_replicates_scatter_within_scenes_and_scenes_by_their_means(made: Any, m
         wanted = {name: 100 * math.expm1(of / 100) for name, of in wanted.items()}
     assert row["scatter_replicates"] == pytest.approx(wanted["replicates"])
     assert row["scatter_scenes"] == pytest.approx(wanted["scenes"])
+    half = stats.t.ppf(0.975, 2) * 4.0 * math.sqrt(1 + 1 / 3)
+    new = [7 - half, 7 + half]
+    if metric in AMOUNTS:
+        new = [100 * math.expm1(end / 100) for end in new]
+    assert (row["new_low"], row["new_high"]) == pytest.approx(new)
     assert fern["scatter_replicates"] == pytest.approx(wanted["fern"])
     assert math.isnan(fern["scatter_scenes"])
-
-
-def test_one_replicate_a_scene_has_no_scatter_of_replicates(made: Any) -> None:
-    add_nested(made, {"fern": (1.0,), "room": (3.0,)})
-    row = mean_of(compared(made), "psnr")
-    assert math.isnan(row["scatter_replicates"])
-    assert row["scatter_scenes"] == pytest.approx(math.sqrt(2))
-
-
-@pytest.mark.parametrize("metric", ["psnr", "evaluations"])
-def test_the_interval_of_a_new_scene_is_scipys(made: Any, metric: str) -> None:
-    add_nested(made, NESTED, metric)
-    row = mean_of(compared(made), metric)
-    half = stats.t.ppf(0.975, 2) * 4.0 * math.sqrt(1 + 1 / 3)
-    wanted = [7 - half, 7 + half]
-    if metric in AMOUNTS:
-        wanted = [100 * math.expm1(end / 100) for end in wanted]
-    assert (row["new_low"], row["new_high"]) == pytest.approx(wanted)
-
-
-def test_one_scene_says_nothing_of_a_new_one(made: Any) -> None:
-    add_nested(made, {"fern": (1.0, 3.0, 5.0)})
-    row = mean_of(compared(made), "psnr")
-    assert not math.isnan(row["low"])
-    assert math.isnan(row["new_low"])
+    assert math.isnan(fern["new_low"]), "one scene says nothing of a new one"
+    trex: Any = comparison.per_scene.xs(("consistency", "", "trex", metric))
+    assert math.isnan(trex["scatter_replicates"])
 
 
 SCORES, WORK = ("psnr", "psnr_pooled", "psnr_worst", "lpips"), ("evaluations", "gaussians")
@@ -154,15 +121,6 @@ def test_headline_labels_are_corrected_by_holm_among_themselves(made: Any) -> No
     assert means["holm"].xs("b", level="label").isna().all()
     assert means["holm"].notna().sum() == 6
     assert means["q"].notna().sum() == 9
-
-
-def test_what_is_no_outcome_is_no_test(made: Any) -> None:
-    add_random(made, ("a",), {"": 3})
-    design = Design(outcomes=("ssim",))
-    means = compare(made.read().cells, METRICS, design=design).means.droplevel([0, 1])
-    assert means.index[means["outcome"]].tolist() == ["ssim"]
-    assert means["q"]["ssim"] == pytest.approx(means["p"]["ssim"])
-    assert means["q"].notna().sum() == means["p_equivalent"].notna().sum() == 1
 
 
 def test_equal_values_are_no_members_of_the_family(made: Any) -> None:

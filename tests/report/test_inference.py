@@ -1,7 +1,7 @@
 """The statistics of a report, against scipy's and closed forms."""
 
 import math
-from itertools import combinations, pairwise
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -77,12 +77,6 @@ def test_the_interval_is_scipys(values: list[float]) -> None:
     assert found == pytest.approx(wanted, rel=1e-9)
 
 
-def test_more_values_make_a_narrower_interval() -> None:
-    widths = half_width(np.ones(30), np.arange(1.0, 31.0))
-    assert math.isnan(widths[0])
-    assert all(wide > narrow for wide, narrow in pairwise(widths[1:]))
-
-
 def test_less_is_a_gap_where_less_is_better() -> None:
     args = np.array([0.4]), np.array([0.1]), np.array([0.2])
     assert share_of_gap(*args, higher_is_better=False)[0] == pytest.approx([150.0])
@@ -108,9 +102,7 @@ def test_a_known_ratio_is_numpys(base: float, value: float) -> None:
     [
         (1.0, 0.0, NOT_POSITIVE),
         (-1.0, 2.0, NOT_POSITIVE),
-        (2.0, -1.0, NOT_POSITIVE),
         (-2.0, -1.0, NOT_POSITIVE),
-        (0.0, 1.0, NOT_POSITIVE),
         (math.nan, 1.0, NOT_MEASURED),
         (1.0, math.inf, NOT_FINITE),
         (math.inf, math.inf, NOT_FINITE),
@@ -157,27 +149,12 @@ def test_the_sign_test_is_scipys(up: int, down: int) -> None:
     assert found == pytest.approx(wanted, rel=1e-9)
 
 
-def test_seven_scenes_of_one_sign_are_the_fewest_with_p_below_2_percent() -> None:
-    up = np.arange(1.0, 8.0)
-    assert sign_test(up, np.zeros(7)) == pytest.approx([1, 0.5, 0.25, 0.125, 0.0625, 2**-5, 2**-6])
-
-
 @given(SCATTERED, st.floats(0, 50))
 def test_equivalence_is_two_one_sided_t_tests(values: list[float], margin: float) -> None:
     found = equivalence(*summed_up(values), np.array([margin]))[0]
     above = stats.ttest_1samp(values, -margin, alternative="greater").pvalue
     below = stats.ttest_1samp(values, margin, alternative="less").pvalue
     assert found == pytest.approx(max(above, below), rel=1e-6, abs=1e-12)
-
-
-@given(SCATTERED, st.floats(0, 50))
-def test_equivalence_is_a_90_percent_interval_within_the_margin(
-    values: list[float], margin: float
-) -> None:
-    p = equivalence(*summed_up(values), np.array([margin]))[0]
-    low, high = stats.ttest_1samp(values, 0).confidence_interval(0.90)
-    if abs(p - 0.05) > 1e-9:
-        assert (p < 0.05) == (-margin < low and high < margin)
 
 
 def test_equal_values_are_equivalent_within_the_margin_alone() -> None:
@@ -200,12 +177,6 @@ def test_holm_is_closed_testing_with_bonferroni(values: list[float]) -> None:
         ]
         wanted = max(min(1.0, len(of) * p[list(of)].min()) for of in subsets)
         assert found[one] == pytest.approx(wanted, rel=1e-12)
-
-
-def test_holm_by_hand() -> None:
-    """Of 0.01, 0.02, 0.03, 0.04 times 4, 3, 2, 1: none is less than the one before it."""
-    found = holm(np.array([0.04, 0.01, 0.03, 0.02]))
-    assert found == pytest.approx([0.06, 0.04, 0.06, 0.06])
 
 
 @given(st.lists(st.one_of(P, st.just(math.nan)), max_size=40))

@@ -47,6 +47,9 @@ def two(made: Any) -> tuple[Path, str, str]:
 
 
 def test_two_sweeps_are_joined(two: tuple[Path, str, str]) -> None:
+    ids = [f"{number:016x}" for number in range(40)]
+    assert len(report_name(ids)) < 150
+    assert report_name(ids) != report_name(ids[:-1])
     path, first, second = two
     report = build(path, [first, second], pictures=[])
     assert report.folder == path / "reports" / f"{first}+{second}"
@@ -84,12 +87,6 @@ def test_two_different_cells_in_one_place_are_refused(
         build(b, [first, other], pictures=[])
 
 
-def test_a_long_list_of_sweeps_has_a_short_name() -> None:
-    ids = [f"{number:016x}" for number in range(40)]
-    assert len(report_name(ids)) < 150
-    assert report_name(ids) != report_name(ids[:-1])
-
-
 def test_a_sweep_that_runs_is_reported_with_what_is_done(made: Any) -> None:
     for seed in range(2):
         made.add(seed=seed)
@@ -108,14 +105,6 @@ def test_a_sweep_that_runs_is_reported_with_what_is_done(made: Any) -> None:
         "pending  not trained yet: it waits for another cell's count",
     ):
         assert reason in report.text
-
-
-def test_a_report_in_which_nothing_is_done_yet_says_so(made: Any) -> None:
-    for label in ("baseline", "plus"):
-        made.add(label)
-        remove_cell(made.store.cell(made.rows[-1]["cell_id"]))
-    report = build(made.store.path, made.write(), pictures=[])
-    assert "2 of 2 cells are not done yet" in report.text
 
 
 def test_a_picture_of_a_trimmed_cell_says_that_its_images_were_removed(made: Any) -> None:

@@ -13,7 +13,6 @@ from xrgs.report.writing import (
     interval,
     lacking,
     marked,
-    named,
     number,
     p_value,
     same_sign,
@@ -54,16 +53,13 @@ def test_changes_are_signed(value: float, text: str) -> None:
     ("value", "unit", "text"),
     [
         (83.456, "s", "83 s"),
-        (8.3456, "s", "8.35 s"),
         (1234.5, "s", "1,234 s"),
         (56812.0, "", "56,812"),
-        (9_999_999.0, "", "9,999,999"),
         (12_345_678.0, "", "12.3 M"),
         (999_400_000.0, "", "999 M"),
         (999_600_000.0, "", "1.00 G"),
         (17_901_503_296.0, "", "17.9 G"),
         (1.302e12, "", "1.30 T"),
-        (7.0, "", "7"),
         (0.81234, "", "0.8123"),
         (24.0, "dB", "24.00 dB"),
         (3 * 2**20, "bytes", "3.0 MiB"),
@@ -97,15 +93,8 @@ SURE = {"low": 1.0, "high": 9.0, "q": 0.01}
 )
 def test_what_the_tests_allow_to_be_said_of_psnr(row: Change, text: str) -> None:
     assert verdict(row, BY_NAME["psnr"]) == text
-
-
-def test_less_gaussians_are_better() -> None:
-    assert verdict(change(-5.0, **SURE), BY_NAME["gaussians"]) == "better"
-
-
-@pytest.mark.parametrize(("p", "text"), [(0.0004, "<0.001"), (0.05, "0.050"), (math.nan, "")])
-def test_a_p_has_three_decimals(p: float, text: str) -> None:
-    assert p_value(p) == text
+    if text in {"better", "worse"}:  # fewer Gaussians are better
+        assert {text, verdict(row, BY_NAME["gaussians"])} == {"better", "worse"}
 
 
 @pytest.mark.parametrize(
@@ -119,14 +108,10 @@ def test_values_are_counted_by_the_sign_of_their_mean(
     assert same_sign(change(mean, up=up, down=down, n=1, p_sign=1.0)) == ""
 
 
-def test_an_interval_has_two_signed_ends() -> None:
+def test_p_has_three_decimals_and_an_interval_two_signed_ends() -> None:
+    assert [p_value(p) for p in (0.0004, 0.05, math.nan)] == ["<0.001", "0.050", ""]
     assert interval(-1.204, 3.4) == "-1.20 to +3.40"
     assert interval(math.nan, math.nan) == ""
-
-
-def test_a_metric_is_named_with_the_unit_of_its_changes() -> None:
-    names = {named(metric) for metric in METRICS}
-    assert {"PSNR, dB", "PSNR (worst view), dB", "LPIPS, %", "SSIM, %", "Memory, %"} <= names
 
 
 @pytest.mark.parametrize(("scenes", "text"), [(0, ""), (2, " (2 of 3)"), (3, "")])
@@ -137,7 +122,4 @@ def test_a_mean_that_lacks_a_scene_says_so(scenes: int, text: str) -> None:
     equivalent = row._replace(p_equivalent=0.01)
     assert marked(equivalent, BY_NAME["psnr"], 3) == f"+5.00 ↑ ≈{text}"
     assert marked(row._replace(q=0.9), BY_NAME["psnr"], 3) == f"+5.00 ↑{text}"
-
-
-def test_what_is_missing_has_no_mark() -> None:
     assert marked(None, BY_NAME["psnr"], 3) == "missing"

@@ -46,13 +46,8 @@ def test_frames_at_test_views_are_their_renders(model: MakeModel, tmp_path: Path
         expected = render(shown, Camera(view.camera.viewmat, K, 48, 36))
         assert np.abs(frame.astype(int) - expected).max() <= 1  # of the viewmat's last digit
         assert expected.std() > 10
-
-
-def test_the_default_size_leaves_out_an_odd_column(model: MakeModel, tmp_path: Path) -> None:
-    shown = model()
-    make_film([shown], tmp_path / "frames", path="test", views=2)
-    frame = pictures(tmp_path / "frames")[0]
-    whole = render(shown, shown.views[2].camera)
+    make_film([shown], tmp_path / "default", path="test", views=2)  # it leaves out an odd column
+    frame, whole = pictures(tmp_path / "default")[0], render(shown, shown.views[2].camera)
     assert frame.shape == (36, 48, 3)
     assert np.abs(frame.astype(int) - whole[:, :48]).max() <= 1
 
@@ -109,7 +104,6 @@ def test_a_film_that_fails_leaves_the_old_one(
         ({"views": 0}, "views=0: must be from 1 to 100000"),
         ({"fps": 0}, "fps=0: must be from 1 to 240"),
         ({"size": (33, 32)}, "size=33x32: must be even numbers from 16 to 8192"),
-        ({"size": (8, 32)}, "size=8x32: must be"),
         ({"out": "film.avi"}, "film.avi: must end with .mp4, or be a folder"),
         ({"out": "full"}, "full: the folder is not empty; name a new one"),
         ({"out": "full/file"}, "full/file: can't be written"),
@@ -143,7 +137,7 @@ def test_without_pyav_the_extra_is_named(
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("size", [(96, 64), (96, 718), (96, 720), (1920, 64)], ids=str)
+@pytest.mark.parametrize("size", [(96, 64), (96, 720), (1920, 64)], ids=str)
 def test_the_colours_of_a_film_are_those_of_its_frames_at_every_size(
     tmp_path: Path, size: tuple[int, int]
 ) -> None:

@@ -112,16 +112,13 @@ def on_a_dome(seed: int) -> Poses:
     ("poses", "path"),
     [
         (ring(np.arange(0.0, 360.0, 10.0)), "orbit"),
-        (ring(np.arange(0.0, 360.0, 45.0)), "orbit"),
         (ring(np.array([350.0, 5.0, 20.0, 30.0])), "orbit"),
         (on_a_dome(0), "orbit"),
-        (on_a_dome(1), "orbit"),
         (facing_one_way(), "orbit"),
         (outwards(np.arange(0.0, 360.0, 10.0)), "training"),
-        (outwards(np.arange(0.0, 360.0, 10.0), radius=0.2), "training"),
         (outwards(np.arange(0.0, 180.0, 10.0)), "training"),
     ],
-    ids=["ring", "few", "arc", "dome", "another-dome", "forward", "room", "panorama", "half-room"],
+    ids=["ring", "arc", "dome", "forward", "room", "half-room"],
 )
 def test_an_orbit_is_the_default_where_the_cameras_see_its_space(poses: Poses, path: str) -> None:
     assert paths.default_path(poses) == path
@@ -177,9 +174,6 @@ def test_the_spiral_is_llffs() -> None:
     assert camera_positions(path) == pytest.approx(positions, abs=1e-12)
     ours = path[:, :3, :3].transpose(0, 2, 1) * np.array([1, -1, -1])  # columns: r, u, b
     assert ours == pytest.approx(axes, abs=1e-12)
-
-
-def test_a_spiral_needs_cameras_that_face_one_way() -> None:
     with pytest.raises(XrgsError, match=r"path=spiral: .* --path orbit"):
         paths.spiral(ring(np.arange(0.0, 360.0, 30.0)), 4)
 
@@ -188,6 +182,8 @@ def test_the_path_through_test_views_meets_each_of_them() -> None:
     poses = facing_one_way()
     path = paths.through_test_views(poses, 10)  # three steps between two of four
     assert path[::3] == pytest.approx(poses.test, abs=1e-12)
+    still = paths.through_test_views(Poses(poses.train, poses.test[:1], poses.points), 3)
+    assert (still == poses.test[0]).all()
     two = Poses(poses.train, poses.test[:2], poses.points)
     middle = paths.through_test_views(two, 3)[1]
     first, last = (Rotation.from_matrix(viewmat[:3, :3]) for viewmat in two.test)
@@ -195,12 +191,6 @@ def test_the_path_through_test_views_meets_each_of_them() -> None:
     assert (half * first.inv()).magnitude() == pytest.approx((last * half.inv()).magnitude())
     ends = camera_positions(two.test)
     assert camera_positions(middle[None])[0] == pytest.approx(ends.mean(axis=0))
-
-
-def test_one_test_view_makes_a_still() -> None:
-    poses = facing_one_way()
-    path = paths.through_test_views(Poses(poses.train, poses.test[:1], poses.points), 3)
-    assert (path == poses.test[0]).all()
 
 
 @pytest.mark.parametrize("name", paths.PATHS)

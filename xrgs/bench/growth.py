@@ -16,9 +16,6 @@ ALL_LOADS = "all loads"
 def fit_growth(rows: Sequence[Row]) -> list[Row]:
     """Fit power laws to the times of the first method on one thread.
 
-    Args:
-        rows: The rows of `rendering.time_load` for loads of several sizes.
-
     Returns:
         A row for each growing quantity (`grows`: "Gaussians" or "pixels") and each size of the
         other quantity (`at`), with `sizes` in ascending order, `ms` (forward plus backward), and

@@ -194,10 +194,6 @@ def write(path: Path, load: Load) -> None:
 def load_from_cell(folder: Path, view_name: str) -> Load:
     """Make a load of a trained cell's Gaussians and one of its views.
 
-    Args:
-        folder: Folder of the cell in its store.
-        view_name: Name of a training or test view.
-
     Raises:
         XrgsError: The cell isn't done, its variant isn't in the store, or it has no such view.
     """

@@ -50,11 +50,7 @@ class RenderMethod:
 
 
 def default_methods(backends: Sequence[str]) -> list[RenderMethod]:
-    """Return each backend with gsplat's settings, torch in float64, and three other cut-offs.
-
-    Args:
-        backends: Names of the backends; only the first is measured with the other cut-offs.
-    """
+    """Return all backends with gsplat's settings, torch in float64, the first with other cuts."""
     first, defaults = backends[0], RasterSettings()
     return [
         *(RenderMethod(name, name) for name in backends),

@@ -50,7 +50,7 @@ SMOKE = BenchmarkSizes(
     gaussians=(200, 400),
     images=((32, 24), (48, 36)),
     step=(300, 80, 60),
-    memory=(300, 80, 60),
+    memory=(20_000, 64, 48),
     scene=(300, 80, 60),
 )
 #: `size_per_spacing` of the random scene of `against`: 56 Gaussians contribute to a pixel, as in a
@@ -61,9 +61,6 @@ _LR_FACTOR = 5
 
 def run(settings: Settings) -> str:
     """Run the benchmark, or instead `save` or `against`, if set.
-
-    Args:
-        settings: The arguments of `xrgs-bench`.
 
     Returns:
         The text to print.

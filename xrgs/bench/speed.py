@@ -44,12 +44,7 @@ class Trial:
 
 
 def trial(conf: Conf, folder: Path) -> Trial:
-    """Time 200 training steps on a variant; their result is discarded.
-
-    Args:
-        conf: The config of the training; its number of steps is ignored.
-        folder: The variant's folder.
-    """
+    """Time 200 training steps on a variant; their result is discarded."""
     set_torch_threads(conf.threads)
     data = dataset.load(variant.load(folder), conf.train.views)
     short = replace(conf, train=replace(conf.train, steps=_TRIAL, evaluate_every=0))
@@ -63,10 +58,6 @@ def seconds_per_unit(threads: int, backend: str = "auto") -> float:
 
     `xrgs.sweep.estimate` uses the same unit. The result is the median of a few steps on random
     Gaussians.
-
-    Args:
-        threads: Number of threads.
-        backend: `splat.backend`.
     """
     load = random_load(_GAUSSIANS, *_SIZE, seed=0)
     step = TrainingStep(load, resolve_backend(backend), threads)

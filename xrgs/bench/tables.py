@@ -129,13 +129,7 @@ def describe(sizes: Row) -> str:
 
 
 def table(rows: Sequence[Row], columns: Mapping[str, str]) -> str:
-    """Align columns of text, the first to the left and the others to the right.
-
-    Args:
-        rows: The rows.
-        columns: Heading -> format string for the values of a row. A cell is empty if the row lacks
-            a value.
-    """
+    """Align columns of text, the first to the left and the others to the right."""
     lines = [list(columns), *([_cell(form, row) for form in columns.values()] for row in rows)]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return "\n".join(

@@ -18,10 +18,6 @@ def time_interleaved(
 ) -> dict[_Key, list[float]]:
     """Run each task once to warm up, then all tasks in turn (A B A B ...).
 
-    Args:
-        tasks: Key -> task.
-        repeats: Number of timed runs of each task.
-
     Returns:
         Key -> duration of each run, ms.
     """

@@ -125,12 +125,6 @@ def time_steps(
 ) -> list[Row]:
     """Time each part of a training step.
 
-    Args:
-        views: Name of the view, "HR" or "LR" -> load.
-        backend: "native" or "torch".
-        counts: Numbers of threads; the first is 1.
-        repeats: Number of timed runs.
-
     Returns:
         A row for each view and number of threads: sizes, the time of each part and of the step
         (`step_ms`), and the `speedup` over one thread.

@@ -60,13 +60,8 @@ def download(
     published: Any = OmegaConf.to_container(
         OmegaConf.load(config.CONF_DIR / "data" / f"{dataset}.yaml")
     )
-    arguments = {
-        "url": url,
-        "sha256": sha256,
-        "max_bytes": max_bytes,
-        "redirect_hosts": redirect_hosts,
-    }
-    changes: Any = {key: value for key, value in arguments.items() if value is not None}
+    given = {"url": url, "sha256": sha256, "max_bytes": max_bytes, "redirect_hosts": redirect_hosts}
+    changes: Any = {key: value for key, value in given.items() if value is not None}
     root = data_root or Path(OmegaConf.load(config.CONF_DIR / "config.yaml").data_root)
     say(fetch_scenes(replace(DatasetConf(**published), **changes), scenes, root))
 

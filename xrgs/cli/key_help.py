@@ -29,9 +29,6 @@ class Entry(NamedTuple):
 def explain(key: str) -> str:
     """Return a key's value in the baseline and its comment; for a group, also those of its keys.
 
-    Args:
-        key: A key or a group, as `train.steps` or `train`.
-
     Raises:
         XrgsError: There is no such key; the message offers similar ones.
     """

@@ -167,20 +167,18 @@ def errors_as_messages(command: str, argument: re.Pattern[str] | None = None) ->
         SystemExit: With the message, instead of the error.
     """
     try:
-        _check_current_folder()
+        try:
+            Path.cwd()
+        except OSError as error:
+            raise XrgsError(
+                f"the current folder can't be found ({error}): cd to another"
+            ) from error
         yield
     except XrgsError as error:
         message = str(error)
         if argument and (match := argument.fullmatch(message)):
             message = f"{_option(match[1])} {match[2]}"
         sys.exit(for_line(f"{command}: {message}"))
-
-
-def _check_current_folder() -> None:
-    try:
-        Path.cwd()
-    except OSError as error:
-        raise XrgsError(f"the current folder can't be found ({error}): cd to another") from error
 
 
 def answer_version(command: str) -> None:

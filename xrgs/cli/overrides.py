@@ -70,27 +70,14 @@ _NAMES = frozenset({"variant.test"})
 _FOLDERS = frozenset({"--config-dir", "-cd", "--config-path", "-cp"})
 _INFO = frozenset({"--info", "-i"})
 #: Options and keys that make Hydra do something else than a sweep.
-_OTHER_MODES = frozenset(
-    (
-        *_INFO,
-        "--cfg",
-        "-c",
-        "--run",
-        "-r",
-        "hydra.mode",
-        "--hydra-help",
-        "--shell-completion",
-        "-sc",
-    )
-)
+_OTHER_MODES = _INFO | {
+    *("--cfg", "-c", "--run", "-r", "hydra.mode", "--hydra-help", "--shell-completion", "-sc")
+}
 
 
 @contextmanager
 def explained(hint: str = "") -> Iterator[None]:
     """Turn errors of Hydra and OmegaConf into one-line errors that propose a correction.
-
-    Args:
-        hint: A text to append to the message.
 
     Raises:
         XrgsError: Instead of the error.
@@ -200,9 +187,6 @@ def with_options_first(words: Sequence[str]) -> list[str]:
 
     `--multirun` is added for a sweep: without it, Hydra checks axes first, and blames them for
     every other mistake.
-
-    Args:
-        words: Arguments of the command line, in any order.
     """
     options: list[str] = []
     overrides: list[str] = []
@@ -233,9 +217,6 @@ def with_quotes(words: Sequence[str]) -> list[str]:
     Paths and names may have any character; a quoted value stays as it is. Commas in `scene.path`
     and in groups of files separate the values of an axis, unless a folder has that name. A list of
     names is `[a,b]`, or `a,b`; `[a,b],[c]` is an axis of two lists. Values of other keys stay.
-
-    Args:
-        words: Arguments of the command line.
 
     Raises:
         XrgsError: A word is not valid Unicode.
@@ -410,11 +391,7 @@ def check_no_axis(words: Sequence[str]) -> None:
 
 
 def files(group: str) -> list[str]:
-    """Return the sorted names of a config group's files; empty if there is no such group.
-
-    Args:
-        group: Name of the group's folder, such as `scene`.
-    """
+    """Return the sorted names of a config group's files; empty if there is no such group."""
     folder = config.CONF_DIR / group
     folder = folder if folder.is_dir() else config.CONF_DIR.parent / group
     names = (file.relative_to(folder).with_suffix("") for file in folder.rglob("*.yaml"))

@@ -19,9 +19,6 @@ def as_they_are(photographs: str) -> list[str]:
 
     Views are tagged HR and LR by their measured sampling rates.
 
-    Args:
-        photographs: The folder, the folder with `/**`, or the video.
-
     Raises:
         XrgsError: There is no such folder or video.
     """

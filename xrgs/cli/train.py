@@ -202,7 +202,7 @@ def _place(words: _Words) -> _Placed | None:
     if planned.id is None:
         _say("without --dry-run, their cameras are found, and a recipe is chosen for them")
         return None
-    report = ReportStore(store).variant_report(planned.id)
+    report = ReportStore(store.path).variant_report(planned.id)
     mix = mixture(read_views(store.variants, planned.id))
     _say(f"{name}: the cameras of {report.registered} of {report.images} {kind}s are found")
     _say(

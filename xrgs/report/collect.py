@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import cache
 from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
@@ -135,11 +136,6 @@ def read_cells(
 ) -> Sweep:
     """Read every cell of the rows of sweeps' records.
 
-    Args:
-        store: The store that has the cells.
-        commands: The id of each sweep -> the arguments of `xrgs-sweep`.
-        rows: The rows.
-
     Raises:
         ReportError: A row contradicts its cell's identity.
     """
@@ -261,43 +257,41 @@ def _curve(
 def _done_columns(cell_id: str, cell: DoneCell) -> dict[str, Any]:
     """Return the columns of `Sweep.cells` for a done cell, without its scores."""
     figures = msgspec.structs.asdict(cell.summary)
-    train, scored_by = cell.identity.train, without_refactorings(cell.status.scored_by)
+    train, (scored_by, stale) = cell.identity.train, _scored(*cell.status.scored_by.items())
     variant = cell.config.variant if cell.config else None
+    # Times of several machines in turn can't be compared with those of any other cell.
+    turns = cell.provenance.machines_in_turn
+    machine_name = f"cell {cell_id} in turn: {turns}" if turns else machine(cell.provenance)
     return {
         **{metric.name: figures[metric.name] for metric in METRICS if metric.name in figures},
         **{f"{name}_code": scored_by.get(name, "") for name in _SCORES},
         "state": "done",
         "reason": "",
         "protocol": scored_by.get(PROTOCOL, ""),
-        "stale": " ".join(stale_scores(scored_by)),
+        "stale": stale,
         "validation": train.get("validation", 0.0),
         "steps": cell.summary.steps,
         "long_side": variant.long_side if variant else None,
         "factor": variant.factor if variant else None,
-        "machine": _machine(cell_id, cell.provenance),
+        "machine": for_line(machine_name, _MAX_MACHINE),
     }
 
 
-def _machine(cell_id: str, made: Provenance) -> str:
-    """Return the name of the machine that trained a cell.
-
-    If several machines trained it in turn, the name has the cell's id: its times can't be compared
-    with those of any other cell.
-    """
-    turns = made.machines_in_turn
-    return for_line(f"cell {cell_id} in turn: {turns}" if turns else machine(made), _MAX_MACHINE)
+@cache
+def _scored(*digests: tuple[str, str]) -> tuple[dict[str, str], str]:
+    """Return the digests of scores without refactorings, and the names of the stale scores."""
+    scored_by = without_refactorings(dict(digests))
+    return scored_by, " ".join(stale_scores(scored_by))
 
 
 def _views(done: Mapping[str, DoneCell]) -> pd.DataFrame:
     """Return `Sweep.views`; it has a column even for scores that no cell has."""
-    rows = [
-        {"cell_id": cell_id, "view": view} | scores
-        for cell_id, cell in done.items()
-        for view, scores in cell.scores
-    ]
-    views = pd.DataFrame(rows, columns=["cell_id", "view", *_SCORES])
-    texts: dict[str, Any] = {"cell_id": object, "view": object}
-    return views.astype(texts | dict.fromkeys(_SCORES, np.float64))
+    rows = [(cell_id, view, of) for cell_id, cell in done.items() for view, of in cell.scores]
+    texts = {name: [row[at] for row in rows] for at, name in enumerate(("cell_id", "view"))}
+    scores = {name: [of.get(name, math.nan) for _, _, of in rows] for name in _SCORES}
+    columns = {name: pd.Series(values, dtype=object) for name, values in texts.items()}
+    columns |= {name: pd.Series(values, dtype=np.float64) for name, values in scores.items()}
+    return pd.DataFrame(columns, copy=False)  # one block a column, whose means sum by rows
 
 
 def _cells(

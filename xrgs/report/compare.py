@@ -274,7 +274,7 @@ def _check_comparable(cells: pd.DataFrame, against: str) -> None:
     if not unknown.empty:
         row = unknown.iloc[0]
         raise ReportError(
-            f"cell {row['cell_id']} ({_name(row)}): its {against} {row['base_id']} "
+            f"cell {row['cell_id']} ({run_name(row)}): its {against} {row['base_id']} "
             "is not in the sweep"
         )
     matched = bases.loc[ablations["base_id"]]
@@ -291,7 +291,7 @@ def _check_pairs(ablations: pd.DataFrame, matched: pd.DataFrame, keys: Sequence[
             at = int(np.argmax(differs))
             cell, base = ablations.iloc[at], matched.iloc[at]
             raise ReportError(
-                f"cell {cell['cell_id']} ({_name(cell)}) has {key} {cell[key]}, "
+                f"cell {cell['cell_id']} ({run_name(cell)}) has {key} {cell[key]}, "
                 f"its {base['label']} {cell['base_id']} has {key} {base[key]}: not a pair"
             )
 
@@ -307,12 +307,13 @@ def _one_value(cells: pd.DataFrame, within: list[str], key: str, label: str) -> 
     first = distinct[same].iloc[0]
     raise ReportError(
         f"cells of different {label}s can't share a table: "
-        f"{first['cell_id']} ({_name(first)}) has {first[key]}, "
-        f"{second['cell_id']} ({_name(second)}) has {second[key]}"
+        f"{first['cell_id']} ({run_name(first)}) has {first[key]}, "
+        f"{second['cell_id']} ({run_name(second)}) has {second[key]}"
     )
 
 
-def _name(cell: pd.Series) -> str:
+def run_name(cell: pd.Series) -> str:
+    """Return scene, label, condition and seed of a row of `Comparison.cells` or `pairs`."""
     parts = (cell["scene"], cell["label"], cell["condition"], f"seed {cell['seed']}")
     return ", ".join(str(part) for part in parts if part)
 

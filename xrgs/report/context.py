@@ -190,7 +190,8 @@ def _cautions(
         f"{scene} has no view held out (variant.test_every=0): its scores are of views that were"
         " trained on"
         for scene, config in configs
-        if config and not _holds_out(config)
+        if config
+        and not (config.variant.test_every or config.variant.test or config.train.validation)
     ]
     return tuple(
         for_line(f"Caution: {text}", _MAX_SENTENCE) for text in dict.fromkeys((*few, *trained_on))
@@ -198,12 +199,7 @@ def _cautions(
 
 
 def _cautions_of_photographs(rows: pd.DataFrame, sweep: Sweep) -> list[str]:
-    """Return sentences on test views that have no score, and on mixtures without an LR view.
-
-    Args:
-        rows: The rows of finished cells in `Sweep.cells`.
-        sweep: The sweep.
-    """
+    """Return sentences on test views that have no score, and on mixtures without an LR view."""
     texts = []
     for scene, scene_rows in rows.groupby("scene", sort=False):
         unscored: dict[str, None] = {}
@@ -224,12 +220,6 @@ def _cautions_of_photographs(rows: pd.DataFrame, sweep: Sweep) -> list[str]:
     return [for_line(f"Caution: {text}", _MAX_SENTENCE) for text in texts]
 
 
-def _holds_out(config: Conf) -> bool:
-    """Return whether a cell is scored on views that it was not trained on."""
-    variant = config.variant
-    return bool(variant.test_every or variant.test or config.train.validation)
-
-
 _PAIR = ["label", "condition", "scene", "variant_seed", "seed"]
 #: A view decides a mean change of PSNR if all three hold: without it the mean differs by more than
 #: _MIN_SHARE of the mean, and by more than _MIN_DB; and its distance from the median of the other
@@ -246,10 +236,6 @@ def decided_by_one_view(
 
     A scene has few test views, and PSNR has no bound: a floater in front of one test camera can
     cost its view 10 dB, which is more than all other views gain together.
-
-    Args:
-        comparison: The pairs of cells.
-        views: `Sweep.views`.
 
     Returns:
         (label, condition) -> a sentence for each such pair: the view, and the change with and

@@ -23,11 +23,7 @@ _NOT_REACHED = "not reached"
 
 
 def joined(cells: pd.DataFrame, done: Mapping[str, DoneCell]) -> pd.DataFrame:
-    """Join the curves of all cells that were evaluated during training.
-
-    Args:
-        cells: The table `Comparison.cells`.
-        done: The cells that are done, by their ids.
+    """Join the curves of all of `Comparison.cells` that were evaluated during training.
 
     Returns:
         One row for each evaluation, with `CELL_KEYS` and `CURVE_COLUMNS`, by cell and step.
@@ -101,11 +97,7 @@ def first_reaches(quality: Sequence[float], amounts: Sequence[float], target: fl
 
 
 def times(cells: pd.DataFrame, done: Mapping[str, DoneCell]) -> pd.DataFrame:
-    """Return the time and work in which each cell reaches the final PSNR of its base.
-
-    Args:
-        cells: The table `Comparison.cells`.
-        done: The cells that are done, by their ids.
+    """Return the time and work in which each of `Comparison.cells` reaches its base's final PSNR.
 
     Returns:
         One row for each cell that was evaluated during training and whose base is done:
@@ -116,26 +108,24 @@ def times(cells: pd.DataFrame, done: Mapping[str, DoneCell]) -> pd.DataFrame:
         that early and fall again). If the base ran on another machine, the ratios of time are NaN.
     """
     rows = []
-    for _, cell in cells[cells["cell_id"].isin(done)].drop_duplicates(CELL_KEYS).iterrows():
+    finished = cells[cells["cell_id"].isin(done)].drop_duplicates(CELL_KEYS)
+    for cell in finished.to_dict("records"):
         curve, base = done[cell["cell_id"]].curve, done.get(cell["base_id"])
         if len(curve) == 1 or base is None or math.isnan(base.curve[-1]["psnr"]):
             continue
         end = base.curve[-1]
-        row = dict(cell[CELL_KEYS]) | {"target": end["psnr"]}
+        row = {key: cell[key] for key in CELL_KEYS} | {"target": end["psnr"]}
         for name in ("evaluations", "seconds"):
-            row[name], own = (_first_passage(run, name, end["psnr"]) for run in (curve, base.curve))
+            row[name], own = (
+                first_reaches([at["psnr"] for at in run], [at[name] for at in run], end["psnr"])
+                for run in (curve, base.curve)
+            )
             comparable = not cell["elsewhere"] or name != "seconds"
             for share, whole in (("share", end[name]), ("own_share", own)):
                 has_share = comparable and whole > 0
                 row[f"{name}_{share}"] = row[name] / whole if has_share else math.nan
         rows.append(row)
     return pd.DataFrame(rows, columns=[*CELL_KEYS, "target", *_ROWS])
-
-
-def _first_passage(curve: Sequence[Mapping[str, float]], name: str, target: float) -> float:
-    """Return the time or work at which a curve first reaches a PSNR, dB."""
-    quality, amounts = ([at[key] for at in curve] for key in ("psnr", name))
-    return first_reaches(quality, amounts, target)
 
 
 #: Column of `times` -> the row of a table: its name (`{base}` is the base's label), the factor of

@@ -131,16 +131,19 @@ def _with_program(sweep: Sweep, store: ReportStore, program: External) -> Sweep:
         folder = _folder(program, cell, done)
         cell_id = f"{for_file_name(program.label)}.{number}"  # no cell's id has a dot
         split = "train" if cell["validation"] > 0 else "test"
-        expected = _expected(store, str(cell["variant_id"]), split)
+        variant_views = variant.load(store.variant(str(cell["variant_id"]))).views
+        expected = {view.name: view for view in variant_views if view.split == split}
         bar = progress(list(views), f"scoring {program.label}", "view")
         masked = any(expected[name].mask for name in views)
         scores += [{"cell_id": cell_id} | _score(folder, expected[name], masked) for name in bar]
         renders[cell_id] = folder
+        file = folder / FIGURES
+        figures = read_struct(file, Figures) if file.exists() else Figures()
         rows.append(
             {key: cell[key] for key in (*_VARIANT, *_SHARED, "protocol")}
             | {f"{name}_code": scoring_code()[name] for name in VIEW_METRICS}
             | {"cell_id": cell_id, "label": program.label, "state": "done"}
-            | _figures(folder)
+            | msgspec.structs.asdict(figures)
             | dict.fromkeys(("reason", "stale", "machine"), "")
         )
     views = pd.DataFrame(scores, columns=list(sweep.views.columns)).astype(sweep.views.dtypes)
@@ -178,18 +181,6 @@ def _folder(program: External, cell: Mapping[Hashable, Any], done: pd.DataFrame)
             f"{expected} is expected, with <view>.png for each view that is scored"
         )
     return existing[0]
-
-
-def _figures(folder: Path) -> dict[str, float | None]:
-    """Read `figures.json`: metric -> its value, None if unknown."""
-    file = folder / FIGURES
-    return msgspec.structs.asdict(read_struct(file, Figures) if file.exists() else Figures())
-
-
-def _expected(store: ReportStore, variant_id: str, split: str) -> dict[str, View]:
-    """Return the views of a split of a variant, by name."""
-    frozen = variant.load(store.variant(variant_id))
-    return {view.name: view for view in frozen.views if view.split == split}
 
 
 def _score(folder: Path, view: View, masked: bool) -> dict[str, Any]:

@@ -106,13 +106,9 @@ def differing_crop(first: Image, second: Image, zoom: int = _ZOOM) -> tuple[slic
 def side_by_side(
     title: str, panels: Sequence[Panel], crop: tuple[slice, slice], note: str
 ) -> bytes:
-    """Draw panels in a row with a crop framed, and each panel's crop enlarged below it.
+    """Draw panels of one size in a row, with a crop framed, and enlarged below.
 
-    Args:
-        title: The title of the figure.
-        panels: Photograph, baseline and ablation, of one size.
-        crop: Rows and columns, as `differing_crop` returns them.
-        note: How the crop was chosen, for example "where the two differ most".
+    `crop` has its rows and columns, and `note` says how it was chosen.
     """
     rows, columns = crop
     height, width = panels[0].image.shape[:2]
@@ -141,12 +137,9 @@ def side_by_side(
 def curves(
     title: str, runs: Sequence[tuple[str, pd.DataFrame]], columns: Mapping[str, str]
 ) -> bytes:
-    """Draw training curves over steps: one panel for each column, one line for each run.
+    """Draw histories over `step`: a panel for each of `columns` (-> its title).
 
-    Args:
-        title: The title of the figure.
-        runs: Label and history (with `step` and `columns`) of the baseline, then of the ablation.
-        columns: Column of the history -> title of its panel.
+    A line of it is a run; the runs are the baseline's label and history, then the ablation's.
     """
     figure = _figure(_PANEL * 1.5 * len(columns), _PANEL)
     figure.suptitle(for_line(title, MAX_CELL), fontsize=11)
@@ -173,14 +166,9 @@ def quality_curves(
     """Draw quality during training against time and against alpha evaluations; better is up.
 
     Each label has a colour: a thick line with marks is its mean over scenes, thin lines are its
-    scenes. Horizontal lines are the baseline's final quality.
-
-    Args:
-        title: The title of the figure.
-        scenes: One row for each label, scene and evaluation: `label`, `scene`, `seconds`,
-            `evaluations` and the scores. At most `MAX_ARMS` labels, the baseline first.
-        means: The means over scenes, with the same columns without `scene`.
-        axes: The scores; each has a row of panels.
+    scenes. Horizontal lines are the baseline's final quality. `scenes` has `label` (at most
+    `MAX_ARMS`, the baseline first), `scene`, `seconds`, `evaluations` and the scores of each
+    evaluation; `means` has the same without `scene`.
     """
     figure = _figure(_PANEL * 3 + 2.2, _PANEL * len(axes) + 0.6)
     figure.suptitle(for_line(title, MAX_CELL), fontsize=11)
@@ -243,15 +231,9 @@ def trade_off(
     """Draw quality against the number of Gaussians, a dot for each label; better is up and left.
 
     A numbered dot is a label's mean over scenes. Thin lines lead from the baseline to the ablations
-    in each scene, and blue lines cross at the baseline's mean.
-
-    Args:
-        title: The title of the figure.
-        means: One row for each label, the baseline first: `gaussians`, `scenes` (their number) and
-            a column for each score.
-        scenes: One row for each label and scene, indexed by the label: `scene`, `gaussians` and the
-            scores.
-        axes: The scores; each has a panel.
+    in each scene, and blue lines cross at the baseline's mean. `means` and `scenes` are indexed by
+    label, the baseline first, with `gaussians` and the scores; `means` has the number of `scenes`,
+    and `scenes` the name of each `scene`.
     """
     figure = _figure(_PANEL * 1.1 * len(axes) + 2, max(_PANEL, 0.2 * len(means)))
     figure.suptitle(for_line(title, MAX_CELL), fontsize=11)
@@ -306,14 +288,8 @@ def dependence(title: str, key: str, changes: pd.DataFrame, axes: Sequence[Metri
     """Draw how changes depend on a setting; better is up, and the dashed line is the base.
 
     Each series has a colour: a thick line with marks is its mean over scenes, thin lines are its
-    scenes, and dots are its pairs.
-
-    Args:
-        title: The title of the figure.
-        key: The key of the setting.
-        changes: The key's entry in `xrgs.report.pictures.sensitivities`, with at most
-            `MAX_ARMS - 1` series.
-        axes: The metrics; each has a panel.
+    scenes, and dots are its pairs. `changes` is the key's entry in `pictures.sensitivities`, of at
+    most `MAX_ARMS - 1` series.
     """
     figure = _figure(_PANEL * len(axes), _PANEL + 0.6)
     figure.suptitle(for_line(title, MAX_CELL), fontsize=11)

@@ -6,23 +6,21 @@ records. A store from another machine comes in through `xrgs-store import`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from pathlib import Path
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from xrgs.mixture.paths import trimmed_folder
 from xrgs.report.collect import ReportError
 from xrgs.safeio.sanitize import for_file_name
 from xrgs.store.inspect import read_report
-from xrgs.store.store import BASELINE
+from xrgs.store.store import BASELINE, Store
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
+    from pathlib import Path
 
-    from xrgs.store.cell_folder import CellFolder
     from xrgs.store.inspect import SfmReport
     from xrgs.store.schema import RecordedCell
-    from xrgs.store.store import Store
 
 #: The most ids in the name of a report's folder.
 _MAX_LISTED = 4
@@ -38,11 +36,7 @@ class Choice:
     """Labels of ablations and controls, beside their base; empty for all."""
 
     def rows(self, rows: Sequence[RecordedCell], against: str) -> list[RecordedCell]:
-        """Return the chosen rows of a record.
-
-        Args:
-            rows: The rows.
-            against: The label that all others are compared with; its rows and the baseline's stay.
+        """Return the chosen rows of a record; those of `against` and the baseline stay.
 
         Raises:
             ReportError: No row has a chosen scene or label; the message lists the existing ones.
@@ -73,29 +67,13 @@ def _check_known(key: str, wanted: Iterable[str], choices: Sequence[str]) -> Non
             )
 
 
-@dataclass(frozen=True)
-class ReportStore:
+class ReportStore(Store):
     """A store with the renders of other programs, from which a report is made."""
 
-    store: Store
-    external: Mapping[str, Path] = field(default_factory=dict)
-    """Folders of another program's renders, see `Sweep.renders`."""
-
-    def cell(self, cell_id: str) -> CellFolder:
-        """Return the folder of a cell, whether or not it exists.
-
-        Raises:
-            StoreError: The id is not a valid name of a folder.
-        """
-        return self.store.cell(cell_id)
-
-    def variant(self, variant_id: str) -> Path:
-        """Return the folder of a variant, whether or not it exists.
-
-        Raises:
-            StoreError: The id is not a valid name of a folder.
-        """
-        return self.store.variant(variant_id)
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self.external: Mapping[str, Path] = {}
+        """Folders of another program's renders, see `Sweep.renders`."""
 
     def variant_report(self, variant_id: str) -> SfmReport:
         """Read the SfM report of a variant, even if its images were trimmed.
@@ -103,15 +81,11 @@ class ReportStore:
         Raises:
             StoreError: The store lacks the variant, or its report is damaged or can't be read now.
         """
-        trimmed = trimmed_folder(self.store.variants, variant_id)
-        return read_report(trimmed if trimmed.is_dir() else self.store.variant(variant_id))
+        trimmed = trimmed_folder(self.variants, variant_id)
+        return read_report(trimmed if trimmed.is_dir() else self.variant(variant_id))
 
     def render(self, cell_id: str, view: str) -> Path:
         """Return the file of the render of a view, whether or not it exists.
-
-        Args:
-            cell_id: The id of a cell, or of a row of another program's renders.
-            view: The name of the view.
 
         Raises:
             StoreError: The cell's renders were trimmed, or its id is not a valid name.
@@ -124,15 +98,12 @@ class ReportStore:
 
     def without_paths(self, text: str) -> str:
         """Remove the store's path from a text, so that reports don't depend on it."""
-        return text.replace(f"{self.store.path}/", "")
+        return text.replace(f"{self.path}/", "")
 
     def sweep_records(
         self, sweep_ids: Sequence[str]
     ) -> tuple[dict[str, tuple[str, ...]], list[RecordedCell]]:
         """Join the records of sweeps.
-
-        Args:
-            sweep_ids: The ids of the sweeps.
 
         Returns:
             The id of each sweep -> the arguments of `xrgs-sweep`; and the rows of all records, one
@@ -146,7 +117,7 @@ class ReportStore:
         commands: dict[str, tuple[str, ...]] = {}
         rows: dict[tuple[object, ...], tuple[str, RecordedCell]] = {}
         for sweep_id in sweep_ids:
-            record = self.store.sweep_record(sweep_id)
+            record = self.sweep_record(sweep_id)
             commands[sweep_id] = record.command
             for row in record.cells:
                 key = (row.scene, row.condition, row.label, row.variant_seed, row.seed)

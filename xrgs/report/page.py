@@ -28,7 +28,7 @@ from xrgs.safeio.atomic import write_json, write_text
 from xrgs.safeio.sanitize import counted, for_csv, for_file_name, for_line, for_markdown
 from xrgs.store.provenance import MACHINE_KEYS, without_threads
 from xrgs.store.scoring import PROTOCOL
-from xrgs.store.store import BASELINE, Store
+from xrgs.store.store import BASELINE
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
 
     from xrgs.report.compare import Comparison
     from xrgs.report.external import External
-    from xrgs.store.schema import RecordedCell
 
 #: Up to this many ablations are printed with tables of their own; the files have all.
 _MAX_PRINTED_ABLATIONS = 6
@@ -54,10 +53,6 @@ _PROVENANCE_KEYS = (
 )
 
 
-#: All scenes and ablations.
-_EVERYTHING = Choice()
-
-
 @dataclass(frozen=True)
 class Report:
     """A report that `build` has written."""
@@ -72,18 +67,14 @@ class Report:
 
 @dataclass(frozen=True)
 class Runs:
-    """Data on the trainings of a sweep: curves, counts, times and skipped work."""
+    """Tables of trainings: `work.totals`, `curves.joined`, `curves.times`, `work.skipped`."""
 
     labels: dict[str, list[str]]
     """The labels of each condition's cells, in the sweep's order."""
-    training: pd.DataFrame
-    """Counts of each training: `xrgs.report.work.totals`."""
+    totals: pd.DataFrame
     curves: pd.DataFrame
-    """Quality during training: `xrgs.report.curves.joined`."""
     times: pd.DataFrame
-    """Time and work to the base's final PSNR: `xrgs.report.curves.times`."""
     skipped: pd.DataFrame
-    """Work that each cell skipped: `xrgs.report.work.skipped`."""
 
     @classmethod
     def gather(cls, sweep: Sweep, cells: pd.DataFrame) -> Runs:
@@ -103,7 +94,7 @@ class Runs:
         kinds = (
             (partial(curves.table, base=base), self.times),
             (partial(work.skipped_table, base=base), self.skipped),
-            (work.totals_table, self.training),
+            (work.totals_table, self.totals),
         )
         return [make(frame, of, name) for make, frame in kinds for name, of in self.labels.items()]
 
@@ -114,7 +105,7 @@ def build(
     out: Path | None = None,
     pictures: Sequence[str] | None = None,
     against: str = BASELINE,
-    choice: Choice = _EVERYTHING,
+    choice: Choice = Choice(),  # noqa: B008 - it is frozen
     externals: Sequence[External] = (),
     design: Design | None = None,
 ) -> Report:
@@ -142,84 +133,120 @@ def build(
         ReportError: The sweeps contradict each other, lack a chosen scene or label, or have cells
             that can't be compared; there is no picture of such a name; or `out` can't be written.
     """
-    store = ReportStore(Store(store_path))
+    store = ReportStore(store_path)
     named = (sweep_ids,) if isinstance(sweep_ids, str) else sweep_ids
-    ids = tuple(dict.fromkeys(named or (store.store.latest_sweep(),)))
+    ids = tuple(dict.fromkeys(named or (store.latest_sweep(),)))
     commands, rows = store.sweep_records(ids)
-    base = _base(rows, against)
-    sweep = read_cells(store.store, commands, choice.rows(rows, base))
+    labels = [row.label for row in rows]
+    base = labels[0] if against == BASELINE and BASELINE not in labels else against
+    sweep = read_cells(store, commands, choice.rows(rows, base))
     sweep = with_variants(sweep, store)
     sweep = with_external(sweep, store, externals)
-    store = replace(store, external=sweep.renders)
+    store.external = sweep.renders
     sweep = replace(sweep, views=with_texture(store, sweep.cells, sweep.views))
-    tables = _tables(sweep, base, design)
-    name = _folder_name(ids, choice, against, externals)
-    folder = out if out else store.store.reports / name
+    comparison = compare(sweep.cells, METRICS, base, design)
+    notes = decided_by_one_view(comparison, sweep.views)
+    page = _Page(sweep, Tables(comparison, contexts(sweep), notes))
+    against_base = "" if against == BASELINE else f".against-{for_file_name(against)}"
+    others = "".join(f".with-{for_file_name(one.label)}" for one in externals)
+    name = f"{report_name(ids)}{choice.suffix}{against_base}{others}"
+    folder = out if out else store.reports / name
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        drawn = _write(folder, store, sweep, tables, pictures)
+        drawn = page.write(folder, store, pictures)
     except OSError as error:
         raise ReportError(
             f"the report can't be written to {folder}: {error.filename}: {error.strerror};"
             " name another folder with --out"
         ) from error
     written = {p.file for p in drawn if p.file} | {folder / name for name in _FILES}
-    text = f"{_text(tables, _warnings(sweep))}\n{for_line(f'Page: {folder / PAGE}')}"
+    text = f"{page.text()}\n{for_line(f'Page: {folder / PAGE}')}"
     return Report(text=text, folder=folder, files=tuple(sorted(written)))
 
 
-def _base(rows: Sequence[RecordedCell], against: str) -> str:
-    """Return `against`; for the baseline of sweeps without it, their first label."""
-    labels = [row.label for row in rows]
-    return labels[0] if against == BASELINE and BASELINE not in labels else against
+class _Page:
+    """The tables of a sweep, and what is written of them."""
 
+    def __init__(self, sweep: Sweep, tables: Tables) -> None:
+        self._sweep = sweep
+        self._tables = tables
+        self._warnings = _warnings(sweep)
+        comparison = tables.comparison
+        self._conditions = list(dict.fromkeys(comparison.cells["condition"]))
+        paper = paper_tables(comparison, tables.contexts)
+        #: The tables of all ablations: changes, the paper's numbers, shares of the gap.
+        self._overviews = [*tables.overviews(), *paper, *tables.gaps()]
+        #: Each ablation's table of means and, with several scenes, its table of scenes.
+        self._ablations: list[TextTable] = []
+        for group in comparison.groups:
+            self._ablations.append(tables.mean(*group))
+            if len(comparison.scenes) > 1:
+                self._ablations.append(tables.per_scene(*group))
 
-def _tables(sweep: Sweep, against: str, design: Design | None) -> Tables:
-    """Compare the cells of a sweep."""
-    comparison = compare(sweep.cells, METRICS, against, design)
-    return Tables(comparison, contexts(sweep), decided_by_one_view(comparison, sweep.views))
+    def write(
+        self, folder: Path, store: ReportStore, pictures: Sequence[str] | None
+    ) -> list[Picture]:
+        """Write all files of a report; return its pictures."""
+        (folder / "figures").mkdir(exist_ok=True)
+        sweep, tables, comparison = self._sweep, self._tables, self._tables.comparison
+        runs = Runs.gather(sweep, comparison.cells)
+        drawn = draw(store, comparison, sweep.views, runs.curves, folder / "figures", pictures)
+        _write_data(folder, sweep, comparison, runs)
+        changes = self._changes()
+        write_text(folder / "table.tex", latex_file([table for table in changes if table.rows]))
+        textures = texture_tables(comparison, sweep.views, tables.contexts)
+        everything = [*changes, *textures, *runs.tables(comparison.base), _provenance_table(sweep)]
+        everything = [table for table in everything if table.rows]
+        parts = [
+            f"# Change from {for_markdown(comparison.base)}\n",
+            *(_command_line(sweep_id, command) for sweep_id, command in sweep.commands.items()),
+            *(f"**{for_markdown(line)}**\n" for line in self._warnings),
+            *map(to_markdown, everything),
+            *_photographs(sweep),
+            *(_picture_link(picture, folder) for picture in drawn),
+        ]
+        write_text(folder / "table.md", "\n".join(parts))
+        long = tables.long()
+        write_text(folder / "table.csv", _csv(long))
+        write_document(
+            folder / PAGE,
+            store,
+            sweep,
+            tables,
+            long,
+            everything,
+            runs.curves,
+            self._warnings,
+            pictures=pictures is None or bool(pictures),
+        )
+        return drawn
 
+    def _changes(self) -> list[TextTable]:
+        """Return all tables of changes and values: missing cells first, then overviews."""
+        tables, shown = self._tables, [*self._overviews, *self._ablations]
+        result = [*self._overviews, legend(tables.comparison, shown), *self._ablations]
+        result += [tables.scores(name) for name in self._conditions]
+        result += [tables.values(name) for name in self._conditions]
+        missing = tables.missing()
+        return [missing, *result] if missing else result
 
-def _folder_name(
-    ids: Sequence[str], choice: Choice, against: str, externals: Sequence[External]
-) -> str:
-    """Return the default name of a report's folder, see `build`."""
-    base = "" if against == BASELINE else f".against-{for_file_name(against)}"
-    others = "".join(f".with-{for_file_name(one.label)}" for one in externals)
-    return f"{report_name(ids)}{choice.suffix}{base}{others}"
-
-
-def _write(
-    folder: Path,
-    store: ReportStore,
-    sweep: Sweep,
-    tables: Tables,
-    pictures: Sequence[str] | None,
-) -> list[Picture]:
-    """Write all files of a report; return its pictures."""
-    (folder / "figures").mkdir(exist_ok=True)
-    comparison = tables.comparison
-    runs = Runs.gather(sweep, comparison.cells)
-    drawn = draw(store, comparison, sweep.views, runs.curves, folder / "figures", pictures)
-    _write_data(folder, sweep, comparison, runs)
-    changes = _change_tables(tables)
-    write_text(folder / "table.tex", latex_file([table for table in changes if table.rows]))
-    textures = texture_tables(comparison, sweep.views, tables.contexts)
-    everything = [*changes, *textures, *runs.tables(comparison.base), _provenance_table(sweep)]
-    page = _markdown_page(sweep, comparison.base, everything, drawn, folder)
-    write_text(folder / "table.md", page)
-    write_text(folder / "table.csv", _csv(tables.long()))
-    write_document(
-        folder / PAGE,
-        store,
-        sweep,
-        tables,
-        everything,
-        runs.curves,
-        _warnings(sweep),
-        pictures=pictures is None or bool(pictures),
-    )
-    return drawn
+    def text(self) -> str:
+        """Return the text for a terminal, which has only some of the tables."""
+        tables, printed = self._tables, list(self._overviews)
+        if len(tables.comparison.groups) <= _MAX_PRINTED_ABLATIONS:
+            printed += self._ablations
+        if tables.comparison.groups:
+            printed.append(legend(tables.comparison, printed))
+        else:
+            printed += [tables.values(name) for name in self._conditions]
+        if missing := tables.missing():
+            more = len(missing.rows) - _MAX_PRINTED_MISSING
+            notes = (*missing.notes, *([f"and {more} more, in table.md"] if more > 0 else []))
+            first = replace(missing, rows=missing.rows[:_MAX_PRINTED_MISSING], notes=notes)
+            printed.insert(0, first)
+        return "\n".join(
+            [*(to_text(table) for table in printed if table.rows), *map(for_line, self._warnings)]
+        )
 
 
 #: The page of a report.
@@ -251,7 +278,7 @@ def _write_data(folder: Path, sweep: Sweep, comparison: Comparison, runs: Runs) 
     whole = cells[counts].astype("Int64").astype(object)  # without a decimal point, or missing
     write_text(folder / "cells.csv", _csv(cells[[*order, *metrics]].assign(**whole)))
     write_text(folder / "views.csv", _csv(views))
-    write_text(folder / "training.csv", _csv(runs.training))
+    write_text(folder / "training.csv", _csv(runs.totals))
     write_text(folder / "curves.csv", _csv(runs.curves))
     write_text(folder / "time_to_quality.csv", _csv(runs.times))
     write_text(folder / "skipped.csv", _csv(runs.skipped))
@@ -262,53 +289,6 @@ def _write_data(folder: Path, sweep: Sweep, comparison: Comparison, runs: Runs) 
 def _csv(table: pd.DataFrame) -> str:
     safe = table.rename(columns=for_csv).map(for_csv)
     return str(safe.to_csv(index=False, lineterminator="\n"))
-
-
-def _change_tables(tables: Tables) -> list[TextTable]:
-    """Return all tables of changes and values: missing cells first, then overviews."""
-    comparison = tables.comparison
-    overviews, ablations = _overviews(tables), _ablation_tables(tables)
-    result = [*overviews, legend(comparison, [*overviews, *ablations]), *ablations]
-    conditions = dict.fromkeys(comparison.cells["condition"])
-    result += [tables.scores(name) for name in conditions]
-    result += [tables.values(name) for name in conditions]
-    missing = tables.missing()
-    return [missing, *result] if missing else result
-
-
-def _overviews(tables: Tables) -> list[TextTable]:
-    """Return the tables of all ablations: changes, the paper's numbers, shares of the gap."""
-    paper = paper_tables(tables.comparison, tables.contexts)
-    return [*tables.overviews(), *paper, *tables.gaps()]
-
-
-def _ablation_tables(tables: Tables) -> list[TextTable]:
-    """Return each ablation's table of means and, with several scenes, its table of scenes."""
-    comparison = tables.comparison
-    result = []
-    for group in comparison.groups:
-        result.append(tables.mean(*group))
-        if len(comparison.scenes) > 1:
-            result.append(tables.per_scene(*group))
-    return result
-
-
-def _markdown_page(
-    sweep: Sweep,
-    base: str,
-    tables: Sequence[TextTable],
-    pictures: Sequence[Picture],
-    folder: Path,
-) -> str:
-    parts = [
-        f"# Change from {for_markdown(base)}\n",
-        *(_command_line(sweep_id, command) for sweep_id, command in sweep.commands.items()),
-        *(f"**{for_markdown(line)}**\n" for line in _warnings(sweep)),
-        *(to_markdown(table) for table in tables if table.rows),
-        *_photographs(sweep),
-        *(_picture_link(picture, folder) for picture in pictures),
-    ]
-    return "\n".join(parts)
 
 
 def _command_line(sweep_id: str, command: Sequence[str]) -> str:
@@ -347,7 +327,8 @@ def _warnings(sweep: Sweep) -> list[str]:
     if (states == "not placed").any():
         heading, *steps = TO_TRY
         warnings.append(f"{heading} {'; '.join(steps)}.")
-    if others := ", ".join(_other_programs(sweep)):
+    programs = sweep.cells.loc[sweep.cells["cell_id"].isin(sweep.renders), "label"]
+    if others := ", ".join(dict.fromkeys(programs)):
         warnings.append(
             f"Renders of another program: {others}. Their PNGs are scored, and compared with the"
             " cells of the lowest seed; time, Gaussians and memory are not known."
@@ -392,29 +373,3 @@ def _stale_warning(sweep: Sweep) -> list[str]:
         f" computed them ({', '.join(scores)}): xrgs-store rescore computes them. A score is"
         " compared between cells that the same code has scored."
     ]
-
-
-def _other_programs(sweep: Sweep) -> list[str]:
-    """Return the labels of other programs' renders."""
-    rows = sweep.cells[sweep.cells["cell_id"].isin(sweep.renders)]
-    return list(dict.fromkeys(rows["label"]))
-
-
-def _text(tables: Tables, warnings: list[str]) -> str:
-    """Return the text for a terminal, which has only some of the tables."""
-    comparison = tables.comparison
-    printed = _overviews(tables)
-    if len(comparison.groups) <= _MAX_PRINTED_ABLATIONS:
-        printed += _ablation_tables(tables)
-    if comparison.groups:
-        printed.append(legend(comparison, printed))
-    else:
-        printed += [tables.values(name) for name in dict.fromkeys(comparison.cells["condition"])]
-    if missing := tables.missing():
-        more = len(missing.rows) - _MAX_PRINTED_MISSING
-        notes = (*missing.notes, *([f"and {more} more, in table.md"] if more > 0 else []))
-        first = replace(missing, rows=missing.rows[:_MAX_PRINTED_MISSING], notes=notes)
-        printed.insert(0, first)
-    return "\n".join(
-        [*(to_text(table) for table in printed if table.rows), *map(for_line, warnings)]
-    )

@@ -105,10 +105,6 @@ def why_no_table(labels: Iterable[str], scenes: Iterable[str]) -> str:
     """Say why a sweep of full XR-GS has no table beside Table 1; empty if it has one.
 
     It is empty too if the sweep has no full XR-GS or no scene of Table 1.
-
-    Args:
-        labels: The labels of the sweep's cells.
-        scenes: The names of the sweep's scenes.
     """
     names = sorted({*scenes})
     others, of_llff = [s for s in names if s not in _LLFF], [s for s in names if s in _LLFF]
@@ -127,7 +123,8 @@ def paper_tables(comparison: Comparison, contexts: Mapping[str, Context]) -> lis
         A table for each condition and each column of the paper whose scenes the comparison has;
         empty if no label is full XR-GS, or the base is not the baseline.
     """
-    if comparison.base != BASELINE:
+    labels = {label for label, _ in comparison.groups}
+    if comparison.base != BASELINE or labels.isdisjoint(_READINGS):
         return []
     names = [metric.name for metric in comparison.metrics]
     per_scene, means = map(by_key, averaged(_as_ratios(comparison), names))
@@ -226,11 +223,6 @@ _PHOTOGRAPH = ["variant_id", "split", "view"]
 def with_texture(store: ReportStore, cells: pd.DataFrame, views: pd.DataFrame) -> pd.DataFrame:
     """Add the texture of each view's photograph to the scores of views.
 
-    Args:
-        store: The stores that have the variants.
-        cells: `Sweep.cells`.
-        views: `Sweep.views`.
-
     Returns:
         The views, with `texture` in intensity per px of the photograph. It is NaN where the
         photograph can't be read, or was removed by a version that did not keep its texture.
@@ -251,11 +243,6 @@ def texture_tables(
     comparison: Comparison, views: pd.DataFrame, contexts: Mapping[str, Context]
 ) -> list[TextTable]:
     """Return tables of changes by texture, for conditions with at least three scenes.
-
-    Args:
-        comparison: The pairs of cells.
-        views: The table that `with_texture` returns.
-        contexts: How the cells of each condition were trained and scored.
 
     Returns:
         Tables with a row for each ablation and score: the change of each scene, the least textured
@@ -386,10 +373,7 @@ def counterparts(
 ) -> list[Counterpart]:
     """Find the view on a report's page that corresponds to each figure of the paper.
 
-    Args:
-        labels: The labels of the page's ablations.
-        views: The test views of the page, `xrgs.report.html.content.Content.views`.
-        training: The training views of the page, `Content.training`.
+    The views are those of `xrgs.report.html.content.Content`.
     """
     names = set(labels)
     return [_counterpart(figure, training if figure.tag else views, names) for figure in _FIGURES]

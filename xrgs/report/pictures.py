@@ -15,7 +15,7 @@ from xrgs.errors import StoreError, UnreadableError
 from xrgs.photos import images
 from xrgs.photos.images import ImageError
 from xrgs.report.collect import ReportError
-from xrgs.report.compare import is_ratio
+from xrgs.report.compare import is_ratio, run_name
 from xrgs.report.curves import means_over_runs, means_over_scenes
 from xrgs.report.figures import (
     MAX_ARMS,
@@ -87,15 +87,7 @@ def draw(
     For each condition: the trade-offs of its ablations if there are several, and quality during
     training if it was evaluated. For each setting with at least three values: the changes over it.
     For each scene and ablation: views and training curves of the first condition and replicate,
-    which the titles name.
-
-    Args:
-        store: The stores with the photographs, renders and histories.
-        comparison: The pairs of cells.
-        views: The table `Sweep.views`.
-        quality: The table that `xrgs.report.curves.joined` returns.
-        folder: The existing folder to write the files to.
-        names: File names without suffix of the pictures to draw; None draws the first 40.
+    which the titles name. `names` are their files without suffix; None draws the first 40.
 
     Returns:
         The pictures, in the order of the tables.
@@ -186,7 +178,7 @@ def _sensitivities(comparison: Comparison) -> dict[str, _Drawing]:
             drawings[name] = partial(_drawn, title, partial(dependence, title, key, rows, axes))
             if (count := rows["series"].nunique()) >= MAX_ARMS:
                 why = f"{count} curves, and a figure can tell {MAX_ARMS - 1} apart"
-                drawings[name] = partial(_not_drawn, title, why)
+                drawings[name] = lambda _, title=title, why=why: Picture(title, None, why)
     return drawings
 
 
@@ -195,9 +187,6 @@ def sensitivities(comparison: Comparison) -> dict[str, pd.DataFrame]:
 
     The values are read from labels, for a setting of the ablation (`consistency.weight=0.05`), and
     from conditions, for a setting that the base has too (`variant.factor=2`).
-
-    Args:
-        comparison: The pairs of cells and their means.
 
     Returns:
         Key of a setting with at least three values -> one row for each change: `level` (`pair`,
@@ -313,10 +302,6 @@ def _drawn(title: str, figure: Callable[[], bytes], file: Path) -> Picture:
     return Picture(title, file)
 
 
-def _not_drawn(title: str, why: str, _: Path) -> Picture:
-    return Picture(title, None, why)
-
-
 def median_view(base: pd.Series, ablation: pd.Series) -> str:
     """Return the view with the median change of PSNR: neither the best nor the worst case.
 
@@ -341,9 +326,9 @@ def _views(
     file: Path,
 ) -> Picture:
     if psnr[0].empty:
-        return Picture(_title(pair), None, "the two cells have no scored view in common")
+        return Picture(run_name(pair), None, "the two cells have no scored view in common")
     view = median_view(*psnr)
-    title = f"{_title(pair)}: view {view}, by change of PSNR the median of {len(psnr[0])}"
+    title = f"{run_name(pair)}: view {view}, by change of PSNR the median of {len(psnr[0])}"
     name = f"{view}.png"
     try:
         check_images(variant.parent, variant.name)
@@ -360,27 +345,19 @@ def _views(
     if len({panel.image.shape for panel in panels}) > 1:
         return Picture(title, None, f"{view}: photograph and renders differ in size")
     note = f"where {base} and {pair['label']} differ most"
-    with atomic_writer(file) as stream:
-        stream.write(side_by_side(title, panels, differing_crop(before, ablation), note))
-    return Picture(title, file)
+    crop = differing_crop(before, ablation)
+    return _drawn(title, partial(side_by_side, title, panels, crop, note), file)
 
 
 def _training(store: ReportStore, pair: pd.Series, base: str, file: Path) -> Picture:
-    title = f"{_title(pair)}: training"
+    title = f"{run_name(pair)}: training"
     runs = []
     for name, key in ((base, "base_id"), (str(pair["label"]), "cell_id")):
         try:
             runs.append((name, store.cell(pair[key]).history()[["step", *_CURVES]]))
         except (StoreError, KeyError):
             return Picture(title, None, f"cells/{pair[key]}/history.csv can't be read")
-    with atomic_writer(file) as stream:
-        stream.write(curves(title, runs, _CURVES))
-    return Picture(title, file)
-
-
-def _title(pair: pd.Series) -> str:
-    parts = (pair["scene"], pair["label"], pair["condition"], f"seed {pair['seed']}")
-    return ", ".join(str(part) for part in parts if part)
+    return _drawn(title, partial(curves, title, runs, _CURVES), file)
 
 
 def _image(store: ReportStore, file: Path) -> NDArray[np.float32]:

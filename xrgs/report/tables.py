@@ -56,13 +56,7 @@ _GAP = {"change": "gap_closed_percent", "low": "gap_low", "high": "gap_high", "w
 
 
 class Tables:
-    """Builds the tables of one comparison.
-
-    Args:
-        comparison: The pairs of cells and their means.
-        contexts: How the cells of each condition were trained and scored.
-        notes: (label, condition) -> sentences under its table.
-    """
+    """Builds the tables of one comparison."""
 
     def __init__(
         self,
@@ -271,10 +265,11 @@ class Tables:
         here = cells[cells["condition"] == condition]
         labels, metrics = list(dict.fromkeys(here["label"])), self._scores()
         done = here[here["state"] == "done"]
-        means = done.groupby(["label", "scene"])[[metric.name for metric in metrics]].mean()
+        names = [metric.name for metric in metrics]
+        means = done.groupby(["label", "scene"])[names].mean().to_dict("index")
         columns = [(scene, metric) for scene in self.comparison.scenes for metric in metrics]
         values = {
-            label: [_at(means[metric.name], (label, scene)) for scene, metric in columns]
+            label: [means.get((label, scene), {}).get(m.name, math.nan) for scene, m in columns]
             for label in labels
         }
         if len(self.comparison.scenes) > 1:
@@ -415,10 +410,6 @@ class Tables:
         return pd.concat([means, scenes])[[*_LEVEL, *_GAP]].rename(columns=_GAP)
 
 
-def _at(means: pd.Series, key: tuple[str, str]) -> float:
-    return float(means[key]) if key in means.index else math.nan
-
-
 def _score(value: float, metric: Metric) -> str:
     """Write a score as papers do: dB with two decimals, the others with three."""
     return "n/a" if math.isnan(value) else f"{value:.{2 if metric.unit == 'dB' else 3}f}"
@@ -434,14 +425,7 @@ def _best(values: list[float], metric: Metric) -> list[int]:
 
 
 def _mean_row(row: Change, metric: Metric, scenes: int, shared: str) -> tuple[str, ...]:
-    """Return the row of a change in the table of its ablation.
-
-    Args:
-        row: The change.
-        metric: The metric that changed.
-        scenes: Number of scenes that the mean should include.
-        shared: A verdict in the table's context, which rows don't repeat.
-    """
+    """Return the row of a change in the table of its ablation."""
     own_verdict = verdict(row, metric)
     return (
         metric.label,

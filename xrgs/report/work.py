@@ -92,11 +92,7 @@ _KINDS = {
 
 
 def totals(cells: pd.DataFrame, done: Mapping[str, DoneCell]) -> pd.DataFrame:
-    """Return the counts of training in each done cell.
-
-    Args:
-        cells: The table `Comparison.cells`.
-        done: The cells that are done, by their ids.
+    """Return the counts of training in each of `Comparison.cells` that is done.
 
     Returns:
         One row for each cell: `CELL_KEYS`, and a column for each count of its history (at the end
@@ -161,11 +157,7 @@ def _work(cell: DoneCell) -> dict[str, float]:
 
 
 def skipped(cells: pd.DataFrame, done: Mapping[str, DoneCell]) -> pd.DataFrame:
-    """Return the work that each cell skipped.
-
-    Args:
-        cells: The table `Comparison.cells`.
-        done: The cells that are done, by their ids.
+    """Return the work that each of `Comparison.cells` skipped.
 
     Returns:
         One row for each cell and kind of work with known counts: `CELL_KEYS` and `kind`; the
@@ -174,7 +166,8 @@ def skipped(cells: pd.DataFrame, done: Mapping[str, DoneCell]) -> pd.DataFrame:
         run. The costs are NaN if unknown.
     """
     rows = []
-    for _, cell in cells[cells["cell_id"].isin(done)].drop_duplicates(CELL_KEYS).iterrows():
+    finished = cells[cells["cell_id"].isin(done)].drop_duplicates(CELL_KEYS)
+    for cell in finished.to_dict("records"):
         run = done[cell["cell_id"]]
         work = _work(run)
         for kind, number, whole, cost in _left_out(work, _work(done.get(cell["base_id"], run))):
@@ -183,7 +176,7 @@ def skipped(cells: pd.DataFrame, done: Mapping[str, DoneCell]) -> pd.DataFrame:
             unit = _kind(kind).unit
             total = work["seconds" if unit == "s" else "evaluations"]
             rows.append(
-                dict(cell[CELL_KEYS])
+                {key: cell[key] for key in CELL_KEYS}
                 | {"kind": kind, "number": number, "share": number / whole, "cost": cost}
                 | {"unit": unit, "cost_share": cost / total if total else math.nan}
             )

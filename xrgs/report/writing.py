@@ -155,12 +155,7 @@ def verdict(row: Change, metric: Metric) -> str:
 
 
 def marked(row: Change | None, metric: Metric, scenes: int) -> str:
-    """Write a mean change with its marks: `-44.57 ↑ * (3 of 4)`.
-
-    Args:
-        row: The change; None if no pair of cells is done.
-        metric: The metric that changed.
-        scenes: Number of scenes that the mean should include.
+    """Write a mean over `scenes` scenes with its marks: `-44.57 ↑ * (3 of 4)`.
 
     Returns:
         The change, `*` if it is shown to be better or worse, `≈` if it is equivalent, and the
@@ -199,12 +194,7 @@ def same_sign(row: Change) -> str:
 
 
 def legend(comparison: Comparison, tables: Sequence[TextTable]) -> TextTable:
-    """Return the table that explains the columns and marks of tables of changes.
-
-    Args:
-        comparison: The comparison of the tables.
-        tables: The tables; only columns and marks that occur in them are explained.
-    """
+    """Return the table that explains the columns and marks that occur in tables of changes."""
     design, base = comparison.design, comparison.base
     outcomes = ", ".join(m.label for m in comparison.metrics if m.name in design.outcomes)
     # Term, the head of its column, the pattern of its mark in a cell's text, meaning.

@@ -62,14 +62,10 @@ def orbit(poses: Poses, views: int) -> Array:
     forward-facing scene, the path swings to and fro over their arc, since the scene was not
     photographed from elsewhere.
 
-    Args:
-        poses: The cameras and points of the scene.
-        views: Number of cameras, at least 1.
-
     Returns:
         [views, 4, 4] world to camera. The path can be repeated without a jump.
     """
-    focus, up = look_at_point(poses), _up(poses.train)
+    focus, up = look_at_point(poses), up_direction(poses)
     first = _perpendicular(up)
     second = np.cross(up, first)
     offsets = camera_positions(poses.train) - focus  # [C, 3]
@@ -94,10 +90,6 @@ def spiral(poses: Poses, views: int) -> Array:
     on the mean camera's axis, at the harmonic mean of 0.9 times the nearest and 5 times the
     farthest depth of the points, with weights 1/4 and 3/4.
 
-    Args:
-        poses: The cameras and points of the scene.
-        views: Number of cameras, at least 1.
-
     Returns:
         [views, 4, 4] world to camera. The path can be repeated without a jump.
 
@@ -108,7 +100,7 @@ def spiral(poses: Poses, views: int) -> Array:
     forward = directions.mean(axis=0)
     if np.linalg.norm(forward) < _MIN_FACING:
         raise XrgsError("path=spiral: the cameras don't face one way; take --path orbit")
-    positions, up = camera_positions(poses.train), _up(poses.train)
+    positions, up = camera_positions(poses.train), up_direction(poses)
     centre = positions.mean(axis=0)
     mean_camera = _look_at(centre, forward, up)
     rotation = mean_camera[:3, :3]  # its rows are the axes right, down, forward
@@ -130,10 +122,6 @@ def through_test_views(poses: Poses, views: int) -> Array:
     Positions are interpolated by cubic Hermite polynomials that don't overshoot (PCHIP), rotations
     at constant angular velocity. The first camera is the first test view, the last one the last.
 
-    Args:
-        poses: The cameras and points of the scene.
-        views: Number of cameras, at least 1.
-
     Returns:
         [views, 4, 4] world to camera.
     """
@@ -145,10 +133,6 @@ def through_training_views(poses: Poses, views: int) -> Array:
 
     It passes through evenly chosen cameras, one for every ten frames: through all of many cameras
     it would shake. In between it is interpolated as in `through_test_views`.
-
-    Args:
-        poses: The cameras and points of the scene.
-        views: Number of cameras, at least 1.
 
     Returns:
         [views, 4, 4] world to camera.
@@ -176,9 +160,6 @@ def default_path(poses: Poses) -> str:
     than the focus is, and looks the same way to 60 degrees. That holds around an object, and on the
     arc in front of a forward-facing scene. In a scene seen from inside, the training cameras look
     outwards and an orbit looks inwards.
-
-    Args:
-        poses: The cameras and points of the scene.
     """
     path = orbit(poses, _PROBES)
     places, focus = camera_positions(path), look_at_point(poses)
@@ -215,11 +196,7 @@ def look_at_point(poses: Poses) -> Array:
 
 def up_direction(poses: Poses) -> Array:
     """Return the mean up direction of the training cameras' images, a unit vector [3]."""
-    return _up(poses.train)
-
-
-def _up(viewmats: Array) -> Array:
-    up = -viewmats[:, 1, :3].mean(axis=0)
+    up = -poses.train[:, 1, :3].mean(axis=0)
     return np.asarray(up / np.linalg.norm(up))
 
 

@@ -53,41 +53,21 @@ def test_the_same_store_gives_the_same_bytes(copied: Path, page: Path) -> None:
 def test_the_page_of_one_cell_shows_the_scene_and_no_furniture_of_a_comparison(alone: Path) -> None:
     parsed = Parsed(alone.read_text())
     order = [attributes["id"] for tag, attributes in parsed.tags if tag == "section"]
-    assert order == [
-        "answer",
-        "splats",
-        "views",
-        "photographs",
-        "training",
-        "curves",
-        "made",
-        "tables",
-    ]
+    sections = "answer splats views photographs training curves made tables"
+    assert order == sections.split()
     assert parsed.texts["h1"][0] == "fern"
     data = data_of(alone)
     assert data["single"]
     assert data["mixed"] == (alone.parent.name == "mixed")
     assert [view["view"] for view in data["views"]] == ["IMG_009", "IMG_001"], "worst first"
     words = " ".join(text for tag, of in parsed.texts.items() if tag != "script" for text in of)
-    for furniture in (
-        "No ablation",
-        "Change from",
-        "Every change",
-        "paper",
-        "Compared with",
-        "arms",
-    ):
-        assert furniture not in words
+    furniture = ("No ablation", "Change from", "Every change", "paper", "Compared with", "arms")
+    assert not [text for text in furniture if text in words]
     assert "it is unknown how the photographs were placed" in words
     terms, texts = ([text for text in parsed.texts[of] if text.strip()] for of in ("dt", "dd"))
     values = dict(zip(terms, texts, strict=True))
-    assert values == {
-        "PSNR": "20.00 dB",
-        "SSIM": "0.8000",
-        "LPIPS": "0.2500",
-        "Gaussians": "5,000",
-        "Training time": "100 s",
-    }
+    scores = {"PSNR": "20.00 dB", "SSIM": "0.8000", "LPIPS": "0.2500"}
+    assert values == scores | {"Gaussians": "5,000", "Training time": "100 s"}
     if not data["mixed"]:
         assert not {"HR", "LR"} & set(re.findall(r"\w+", words))
 
@@ -135,6 +115,9 @@ def test_the_table_of_changes_has_no_column_that_is_empty_in_every_row(
     several = build(made.store.path, pictures=[]).folder / "report.html"
     assert _heads(several)[:5] == ["Ablation", "Scene", "Metric", "Change", "Verdict"]
     assert _heads(several)[7:] == ["From", "To", "Same sign"]  # two values have no q
+    text = several.read_text()
+    assert re.search(r"<th[^>]*>leaves PSNR ↑</th>", text)
+    assert '<p class="note">2 test views a scene</p>' in text
     scenes = re.findall(r'data-scene="(.*?)"', page.read_text())
     assert set(scenes) == {"fern"}  # the filter of scenes finds the only one
 
@@ -145,25 +128,15 @@ def _heads(page: Path) -> list[str]:
     return re.findall(r"<th(?: [^>]*)?>(.*?)</th>", table)
 
 
-def test_the_page_has_each_tables_context_and_headings(made: MadeStore) -> None:
-    for scene in ("fern", "leaves"):
-        made.add(scene=scene)
-        made.add("consistency", scene=scene)
-    made.write()
-    text = (build(made.store.path, pictures=[]).folder / "report.html").read_text()
-    assert re.search(r"<th[^>]*>leaves PSNR ↑</th>", text)
-    assert '<p class="note">2 test views a scene</p>' in text
-
-
-@pytest.mark.parametrize("form", ["latex", "markdown", "csv"])
-def test_a_copy_of_some_changes_has_whole_rows(page: Path, form: str) -> None:
-    changes = data_of(page)["changes"][form]
+def test_a_copy_of_some_changes_has_whole_rows(page: Path) -> None:
     rows = re.findall(r'data-label="(.*?)" data-scene=".*?" data-metric="(.*?)"', page.read_text())
-    assert len(rows) == len(changes["rows"]) == 22
-    for (label, metric), line in zip(rows, changes["rows"], strict=True):
-        assert metric in line
-        assert label in line or label != "consistency"
-    assert not any("PSNR" in line for line in changes["head"] + changes["foot"])
+    for form in ("latex", "markdown", "csv"):
+        changes = data_of(page)["changes"][form]
+        assert len(rows) == len(changes["rows"]) == 22
+        for (label, metric), line in zip(rows, changes["rows"], strict=True):
+            assert metric in line
+            assert label in line or label != "consistency"
+        assert not any("PSNR" in line for line in changes["head"] + changes["foot"])
 
 
 def test_nothing_of_the_store_is_markup(page: Path) -> None:
@@ -187,53 +160,32 @@ def test_the_policy_names_the_style_and_the_script_alone(page: Path) -> None:
         assert f"{tag}-src 'sha256-{digest}'" in policy
 
 
-def test_pictures_none_has_the_tables_alone(copied: Path) -> None:
-    page = build(copied, pictures=[]).folder / "report.html"
-    data = data_of(page)
-    assert data["images"] == data["models"] == data["training"] == []
-    assert [view["view"] for view in data["views"]] == ["IMG_009", "IMG_001"]
-    assert "--pictures none" in page.read_text()
-
-
 @pytest.mark.slow
-def test_a_photograph_says_how_much_a_mask_hides(copied: Path) -> None:
+def test_a_damaged_file_costs_what_it_shows_alone(copied: Path) -> None:
     (home,) = copied.glob("variants/0123*/images/test")
     mask = np.ones(HR[::-1], bool)
     mask[: HR[1] // 4] = False
     home.with_name("test-masks").mkdir()
     images.save_mask(home.with_name("test-masks") / "IMG_001.png", mask)
-    views = data_of(page_of(copied))["views"]
-    assert [(view["view"], view["hidden"]) for view in views] == [("IMG_009", 0), ("IMG_001", 0.25)]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("damaged", "said"),
-    [
-        ("cells/cell00001/splats.ply", "fern, consistency: no training views and no model"),
-        ("cells/cell00001/renders/IMG_001.png", "fern, IMG_001: no render of consistency"),
-    ],
-)
-def test_a_damaged_file_costs_what_it_shows_alone(copied: Path, damaged: str, said: str) -> None:
-    file = copied / damaged
-    content = file.read_bytes()
-    file.write_bytes(b"x" * len(content))  # of the same size: the cell is still done
-    data = data_of(page_of(copied))
-    assert len(data["notes"]) == 1
-    assert said in data["notes"][0]
-    assert str(copied) not in data["notes"][0]
-    others = [arm["label"] for arm in data["views"][0]["arms"] if "image" in arm]
-    assert others == ["baseline", "consistency", HOSTILE]
-
-
-def test_gaussians_that_overflow_are_left_out_alone(copied: Path) -> None:
+    cells = copied / "cells"
+    for file in (cells / "cell00001/splats.ply", cells / "cell00000/renders/IMG_001.png"):
+        file.write_bytes(b"x" * file.stat().st_size)  # of the same size: the cell is still done
     gaussians = make_gaussians(1)
     gaussians.scales[3, 1] = 1e30
-    save_ply(copied / "cells/cell00001/splats.ply", gaussians)
+    save_ply(cells / "cell00002/splats.ply", gaussians)
     data = data_of(page_of(copied))
-    assert [model["label"] for model in data["models"]] == ["baseline", HOSTILE]
-    assert [note for note in data["notes"] if "not finite" in note] == data["notes"]
-    assert len(data["notes"]) == 1
+    assert len(data["notes"]) == 3
+    notes = "\n".join(data["notes"])
+    assert "fern, IMG_001: no render of baseline" in notes
+    assert "fern, consistency: no training views and no model" in notes
+    assert "not finite" in notes
+    assert str(copied) not in notes
+    worst, other = data["views"]
+    labels = ["baseline", "consistency", HOSTILE]
+    assert [arm["label"] for arm in worst["arms"] if "image" in arm] == labels
+    assert [arm["label"] for arm in other["arms"] if "image" in arm] == labels[1:]
+    assert (worst["hidden"], other["hidden"]) == (0, 0.25), "by a mask"
+    assert [model["label"] for model in data["models"]] == ["baseline"]
 
 
 def test_a_page_that_is_too_large_says_what_it_left_out(
@@ -244,9 +196,7 @@ def test_a_page_that_is_too_large_says_what_it_left_out(
     assert data["history"] == []
     assert data["models"]
     assert data["notes"] == ["The page has no history: with it, it would be too large."]
-
-
-def test_images_that_do_not_fit_are_counted(copied: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.undo()
     monkeypatch.setattr(document, "_VIEW_BYTES", 10)
     data = data_of(page_of(copied))
     assert ["photograph" in view for view in data["views"]] == [False, False]
@@ -273,10 +223,16 @@ def test_an_error_map_is_brightest_where_the_render_is_wrong() -> None:
         error_map(Image.fromarray(photograph), Image.new("RGB", (4, 4)))
 
 
-def test_the_context_says_which_arm_differs(copied: Path) -> None:
+def test_without_pictures_there_are_tables_and_the_arms_that_differ(
+    copied: Path,
+) -> None:
     densify = {"prune_scale3d": 10.0}
     configured(Store(copied).cell("cell00001"), splat={"densify": densify})
-    text = html.unescape(build(copied, pictures=[]).folder.joinpath("report.html").read_text())
+    page = build(copied, pictures=[]).folder / "report.html"
+    text, data = html.unescape(page.read_text()), data_of(page)
+    assert data["images"] == data["models"] == data["training"] == []
+    assert [view["view"] for view in data["views"]] == ["IMG_009", "IMG_001"]
+    assert "--pictures none" in text
     assert f"Gaussians above 0.1 (baseline, {HOSTILE}), 10 (consistency) times" in text
     assert "<td>1 HR (48 × 36 px); 2 LR (24 × 18 px); 2 test (48 × 36 px)</td>" in text
     caution = '<p class="warning">Caution: fern has 2 scored views: its scores say little of other'

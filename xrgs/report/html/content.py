@@ -119,12 +119,7 @@ _MAX_ROWS = 240
 
 
 def add_curves(content: Content, quality: pd.DataFrame) -> None:
-    """Add the quality during training of each cell that was evaluated during training.
-
-    Args:
-        content: The content of the page.
-        quality: The table that `xrgs.report.curves.joined` returns.
-    """
+    """Add the quality during training of each cell that was evaluated during training."""
     keys = [*RUN, "label"]
     for _, rows in quality.groupby(keys, sort=False):
         first = rows.iloc[0]
@@ -248,21 +243,14 @@ def page_context(
     contexts: Mapping[str, Context],
     variants: Mapping[str, Variant],
 ) -> list[tuple[str, str]]:
-    """Return the rows (name, text) of the page's section on context.
-
-    Args:
-        sweep: The sweep.
-        comparison: The comparison of its cells.
-        contexts: How the cells of each condition were trained and scored.
-        variants: The readable variants of the cells, by their ids.
-    """
+    """Return the rows (name, text) of the page's section on context."""
     cells = comparison.cells
     done = cells[cells["cell_id"].isin(sweep.done)].drop_duplicates("cell_id")
-    replicates, planned = done.drop_duplicates(["variant_seed", "seed"]), cells["cell_id"].nunique()
+    replicates, planned = done[["variant_seed", "seed"]].to_numpy(), cells["cell_id"].nunique()
     of_many = [
         ("Compared with", shown(comparison.base) if comparison.groups else ""),
         ("Scenes", ", ".join(map(shown, comparison.scenes))),
-        ("Replicates (variant.seed/seed)", _listed(_replicates(replicates))),
+        ("Replicates (variant.seed/seed)", _listed(f"{draw}/{seed}" for draw, seed in replicates)),
         ("Cells", f"{len(done)} of {planned} are done"),
     ]
     rows = of_many if planned > 1 else []
@@ -273,10 +261,6 @@ def page_context(
     provenance = sweep.provenance
     rows += [(name, _listed(provenance.get(key, ["n/a"]))) for key, name in _MADE_WITH.items()]
     return [(name, text) for name, text in rows if text]
-
-
-def _replicates(rows: pd.DataFrame) -> list[str]:
-    return [f"{draw}/{seed}" for draw, seed in zip(rows["variant_seed"], rows["seed"], strict=True)]
 
 
 def _listed(values: Iterable[Any]) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+from functools import cache
 from importlib import resources
 from typing import TYPE_CHECKING, Any
 
@@ -42,6 +43,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
+    from jinja2 import Template
+
     from xrgs.mixture.views import Variant
     from xrgs.report.collect import Sweep
     from xrgs.report.joined import ReportStore
@@ -59,6 +62,7 @@ def write_document(
     store: ReportStore,
     sweep: Sweep,
     tables: Tables,
+    long: pd.DataFrame,
     texts: Sequence[TextTable],
     quality: pd.DataFrame,
     warnings: Sequence[str],
@@ -66,16 +70,6 @@ def write_document(
     pictures: bool,
 ) -> None:
     """Write the report of a sweep as one HTML file of at most `MAX_BYTES`.
-
-    Args:
-        file: The file to write.
-        store: The store with photographs, renders, histories and Gaussians.
-        sweep: The sweep.
-        tables: Builds the tables of the sweep's comparison.
-        texts: All tables of the report, in order.
-        quality: Quality during training, as `xrgs.report.curves.joined` returns it.
-        warnings: Sentences for the top of the page.
-        pictures: Whether the page has photographs, renders and models.
 
     Raises:
         OSError: The file can't be written.
@@ -106,7 +100,7 @@ def write_document(
     }
     content.single = single
     content.mixed = not all(report.alike for report in sweep.variants.values())
-    write_text(file, _fitting(head, content, tables, [table for table in texts if table.rows]))
+    write_text(file, _fitting(head, content, tables, long, texts))
 
 
 def _photographs(sweep: Sweep, *, single: bool) -> list[tuple[str, list[str]]]:
@@ -129,11 +123,40 @@ def _variants(store: ReportStore, cells: pd.DataFrame, content: Content) -> dict
     return variants
 
 
-def _fitting(head: dict[str, Any], content: Content, tables: Tables, texts: list[TextTable]) -> str:
+def _fitting(
+    head: dict[str, Any],
+    content: Content,
+    tables: Tables,
+    long: pd.DataFrame,
+    texts: Sequence[TextTable],
+) -> str:
     """Return the page; parts are left out until it has at most `MAX_BYTES`."""
-    long = tables.long()
+    changes = [*_changes(long, tables.comparison.scenes)]
+    kept = filled_places([_texts(row) for row in changes])
+    listed = filled(_changes_table(changes, head["base"]))
+    labels = [shown(label) for label, _ in tables.comparison.groups]
+    style, script = _source("page.css"), "\n".join(map(_source, _SCRIPTS))
+    copies = [_copies(table) for table in texts]
     for part in ("history", "models", "curves", ""):
-        text = _rendered(head, content, tables, texts, long)
+        text = _template().render(
+            head,
+            policy=_policy(style, script),
+            style=style,
+            script=script,
+            tables=[_printable(table) for table in texts],
+            changes=[row | {"cells": [row["cells"][place] for place in kept]} for row in changes],
+            change_columns=[*zip(listed.columns, listed.align, strict=True)],
+            notes=list(dict.fromkeys(content.notes)),
+            figures=counterparts(labels, content.views, content.training),
+            error_range=ERROR_RANGE,
+            data=vars(content)
+            | {
+                "base": head["base"],
+                "copies": copies,
+                "changes": _lines(listed),
+                "scores": [_score(name) for name in VIEW_METRICS if _is_measured(content, name)],
+            },
+        )
         if len(text.encode()) <= MAX_BYTES or not part:
             break
         setattr(content, part, [])
@@ -141,13 +164,8 @@ def _fitting(head: dict[str, Any], content: Content, tables: Tables, texts: list
     return text
 
 
-def _rendered(
-    head: dict[str, Any],
-    content: Content,
-    tables: Tables,
-    texts: list[TextTable],
-    long: pd.DataFrame,
-) -> str:
+@cache
+def _template() -> Template:
     environment = Environment(
         loader=PackageLoader("xrgs.report.html", "."),
         autoescape=True,
@@ -156,30 +174,7 @@ def _rendered(
         lstrip_blocks=True,
     )
     environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
-    changes = [*_changes(long, tables.comparison.scenes)]
-    kept = filled_places([_texts(row) for row in changes])
-    listed = filled(_changes_table(changes, head["base"]))
-    labels = [shown(label) for label, _ in tables.comparison.groups]
-    style, script = _source("page.css"), "\n".join(map(_source, _SCRIPTS))
-    return environment.get_template("page.html.jinja").render(
-        head,
-        policy=_policy(style, script),
-        style=style,
-        script=script,
-        tables=[_printable(table) for table in texts],
-        changes=[row | {"cells": [row["cells"][place] for place in kept]} for row in changes],
-        change_columns=[*zip(listed.columns, listed.align, strict=True)],
-        notes=list(dict.fromkeys(content.notes)),
-        figures=counterparts(labels, content.views, content.training),
-        error_range=ERROR_RANGE,
-        data=vars(content)
-        | {
-            "base": head["base"],
-            "copies": [_copies(table) for table in texts],
-            "changes": _lines(listed),
-            "scores": [_score(name) for name in VIEW_METRICS if _is_measured(content, name)],
-        },
-    )
+    return environment.get_template("page.html.jinja")
 
 
 def _printable(table: TextTable) -> TextTable:
@@ -266,12 +261,7 @@ def _texts(row: dict[str, Any]) -> tuple[str, ...]:
 
 
 def _changes(long: pd.DataFrame, scenes: Sequence[str]) -> Iterator[dict[str, Any]]:
-    """Yield the rows of the table of all changes, with text, number and class of each cell.
-
-    Args:
-        long: The table `Tables.long`.
-        scenes: The scenes. A single scene has no rows, since the means' rows have its values.
-    """
+    """Yield the rows of the table of all changes, with text, number and class of each cell."""
     metrics = {metric.name: metric for metric in METRICS}
     only = scenes[0] if len(scenes) == 1 else ""
     for row in long.to_dict("records"):

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from xrgs.report.compare import Comparison
     from xrgs.report.html.content import Content
     from xrgs.report.joined import ReportStore
-    from xrgs.viewer.trained import TrainedScene, TrainingView
+    from xrgs.viewer.trained import TrainedScene
 
 #: The largest longer side of an image on the page, px.
 _MAX_SIDE = 1008
@@ -114,11 +114,7 @@ def to_image(array: NDArray[np.float32]) -> Image.Image:
 
 
 def error_map(photograph: Image.Image, render: Image.Image) -> Image.Image:
-    """Draw the difference of a render from its photograph.
-
-    Args:
-        photograph: An image of mode RGB.
-        render: An image of mode RGB and the same size.
+    """Draw the difference of a render from its photograph, RGB images of one size.
 
     Returns:
         The mean absolute difference of the channels, from black at 0 to pale yellow at
@@ -164,7 +160,8 @@ def add_views(
     for cells, view, entry in progress(wanted, "encoding views", "view"):
         content.views.append(entry)
         if max_bytes:
-            pictures = _read(content, store, cells, view, _title(entry))
+            title = ", ".join(filter(None, (entry[key] for key in ("scene", "condition", "view"))))
+            pictures = _read(content, store, cells, view, title)
             left_out += pictures is not None and not _add_images(entry, pictures, album)
             if "size" in entry:
                 entry["hidden"] = _hidden(_photograph(store, cells, view), tuple(entry["size"]))
@@ -173,10 +170,6 @@ def add_views(
             f"The images of {left_out} of {len(wanted)} test views are left out, for the page's"
             " size; their scores are here, and their renders are in the store."
         )
-
-
-def _title(entry: dict[str, Any]) -> str:
-    return ", ".join(filter(None, (entry[key] for key in ("scene", "condition", "view"))))
 
 
 def _photograph(store: ReportStore, cells: pd.DataFrame, view: str) -> Path:
@@ -275,14 +268,6 @@ def add_trained(
     """Add training views with their renders, models for 3D, and the cameras.
 
     They come from the first replicate of each scene and condition whose variant can be read.
-
-    Args:
-        content: The content of the page.
-        store: The store with the cells.
-        comparison: The comparison of the cells.
-        variants: The readable variants, by their ids.
-        max_image_bytes: The most bytes of the images.
-        max_model_bytes: The most bytes of the models as base64.
     """
     first: dict[tuple[str, str], pd.DataFrame] = {}
     for rows in runs(comparison):
@@ -353,7 +338,9 @@ def _add_training_views(
     album: Album,
 ) -> None:
     for view in scene.training_views():
-        places = album.add([to_image(image) for image in _images_of(view)])
+        originals = [] if view.original is None else [view.original]
+        shown_images = [view.photograph, *originals, *view.renders.values()]
+        places = album.add([*map(to_image, shown_images)])
         if places is None:
             content.notes.append(
                 f"{names['scene']}: the training view {shown(view.name)} is left out, for the"
@@ -372,9 +359,3 @@ def _add_training_views(
                 ]
             }
         )
-
-
-def _images_of(view: TrainingView) -> list[NDArray[np.float32]]:
-    """Return the photograph, the original if there is one, and the renders."""
-    before = [] if view.original is None else [view.original]
-    return [view.photograph, *before, *view.renders.values()]
