@@ -90,7 +90,7 @@ def export_splats(path: Path, form: str, out: Path) -> str:
         out: The file, which is replaced.
 
     Returns:
-        A line with the number of Gaussians that were written, and of those that the cell has.
+        A line with the number of Gaussians.
 
     Raises:
         XrgsError: The cell or the file can't be read, or `out` ends otherwise or can't be written.
@@ -122,16 +122,10 @@ def export_splats(path: Path, form: str, out: Path) -> str:
 
 
 def without_invisible(gaussians: Gaussians, alpha_min: float) -> Gaussians:
-    """Leave out the Gaussians that no render shows, because their opacity is below `alpha_min`.
+    """Return new Gaussians without those that no render shows, and without gradients.
 
-    A training leaves them behind where Gaussians fade after its last removal.
-
-    Args:
-        gaussians: N Gaussians.
-        alpha_min: The renderer skips contributions below it (`splat.raster.alpha_min`).
-
-    Returns:
-        New Gaussians, without gradients. Their renders are the same but for rounding.
+    The renderer skips contributions below `alpha_min`, so that renders stay the same but for
+    rounding. A training leaves such Gaussians behind where they fade after its last removal.
     """
     from xrgs.splat.gaussians import Gaussians
 
@@ -236,7 +230,7 @@ def _write_nerfstudio(data: Dataset, images: list[PinholeImage], target: Path) -
     from xrgs.mixture import colmap
 
     colmap.write_points(target / "points.ply", *_points(data))
-    files = {"train": [], "test": []}  # type: dict[str, list[str]]
+    files: dict[str, list[str]] = {"train": [], "test": []}
     for name, split, _ in _views(data):
         files[split].append(f"images/{name}")
     content = {

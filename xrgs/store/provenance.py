@@ -68,7 +68,7 @@ def collect(threads: int, backend: str) -> Provenance:
 
     Args:
         threads: The threads that the cell uses.
-        backend: The rasterizer in use: `native`, `torch` or `gsplat`.
+        backend: `native`, `torch` or `gsplat`.
 
     Raises:
         WeightsError: The weights of LPIPS on this machine are not the published ones. A cell that
@@ -117,11 +117,7 @@ def processor(made: Provenance) -> str:
 
 @cache
 def this_processor(backend: str) -> str:
-    """Return the processor of this machine, named as by `processor`.
-
-    Args:
-        backend: The rasterizer in use: `native`, `torch` or `gsplat`.
-    """
+    """Return the processor of this machine, named as by `processor`."""
     return _processor(_cpu(), _instruction_set(backend))
 
 
@@ -141,12 +137,7 @@ class Machines:
         return {"names": self.names}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Put the machines of a checkpoint, which trained before, in front of this one.
-
-        Raises:
-            KeyError: The state has no names.
-            TypeError: A name is not a text.
-        """
+        """Put the machines of a checkpoint, which trained before, in front of this one."""
         before = state["names"]
         if not isinstance(before, list) or not all(isinstance(name, str) for name in before):
             raise TypeError(f"names: {before!r:.40} must be a list of texts")

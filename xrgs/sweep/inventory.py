@@ -33,15 +33,7 @@ _NAMES = frozenset({"cell_id", "scene", "label", "condition", "variant"})
 
 
 def list_cells(cells: Sequence[CellRow], sort: str) -> str:
-    """Return cells as a table for a terminal.
-
-    Args:
-        cells: The cells.
-        sort: `name`, `age` (the oldest last) or `size` (the largest last).
-
-    Raises:
-        XrgsError: `sort` has another value.
-    """
+    """Return cells as a table, by `name`, `age` (the oldest last) or `size` (the largest last)."""
     if sort not in {"name", "age", "size"}:
         raise XrgsError(f"sort={sort}: choose name, age or size")
     if sort != "name":
@@ -70,7 +62,7 @@ def list_sweeps(sweeps: Sequence[SweepRow]) -> str:
     rows = [
         (
             row.id,
-            _date(row.recorded_at),
+            _date(row.recorded_at) if row.recorded_at else "?",
             _distinct(cell.scene for cell in row.record.cells),
             _distinct(cell.label for cell in row.record.cells),
             _counts(row),
@@ -94,9 +86,7 @@ def _distinct(names: Iterable[str]) -> str:
     return ", ".join(distinct[:_MAX_LISTED]) + (f" and {more} more" if more > 0 else "")
 
 
-def _date(seconds: float | None) -> str:
-    if seconds is None:
-        return "?"
+def _date(seconds: float) -> str:
     return datetime.fromtimestamp(seconds, UTC).astimezone().strftime("%Y-%m-%d %H:%M")
 
 

@@ -32,11 +32,7 @@ class SweepSession:
         return (self.folder / "sweep").is_file()
 
     def begin(self) -> None:
-        """Sign the folder with this process.
-
-        Raises:
-            OSError: The folder can't be written, or belongs to another call.
-        """
+        """Sign the folder with this process."""
         lease.sign(self.folder / "sweep")
 
     def stop(self, reason: str) -> None:

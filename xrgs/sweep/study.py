@@ -103,21 +103,9 @@ class Study:
     """One call of `xrgs-sweep`."""
 
     def __init__(
-        self,
-        context: HydraContext,
-        task: TaskFunction,
-        config: DictConfig,
-        *,
-        brief: bool = False,
+        self, context: HydraContext, task: TaskFunction, config: DictConfig, *, brief: bool = False
     ) -> None:
-        """Keep what Hydra gives its sweeper.
-
-        Args:
-            context: Hydra's context of this call.
-            task: The function that Hydra's launcher calls for each job.
-            config: The config composed from the command line, with its `hydra` node.
-            brief: Print only progress and failures, no plan, notes and tables.
-        """
+        """Keep what Hydra gives its sweeper; `brief` prints only progress and failures."""
         self._brief = brief
         self._context = context
         self._task = task
@@ -130,8 +118,7 @@ class Study:
     def run(self, arguments: Sequence[str]) -> None:
         """Plan the cells, build their variants, train unfinished cells, record and report.
 
-        Args:
-            arguments: Hydra overrides, with the axes among them.
+        The arguments are Hydra overrides, with the axes among them.
 
         Raises:
             CompactHydraException: The user can correct the problem; Hydra prints only the message.
@@ -160,12 +147,7 @@ class Study:
         raise error
 
     def _plan_and_train(self, arguments: Sequence[str]) -> bool:
-        """Return whether every cell is done; after a dry run, whether none is known to fail.
-
-        Raises:
-            StoreError: The store can't be written, or is no longer there.
-            XrgsError: A value of a cell's config is out of its range.
-        """
+        """Return whether every cell is done; after a dry run, whether none is known to fail."""
         launchers.check(self._config)
         arguments = effective(arguments)
         plan = self._plan(arguments)
@@ -181,10 +163,14 @@ class Study:
         for line in () if self._brief else notes:
             log_line(line)
         plan = self._identified(plan, store)
-        past = CostEstimator(store)
-        plan = estimated(plan, past, self._threads(len(plan)))
+        past, machine = CostEstimator(store), usable_cores()
+        capacity = launchers.capacity(self._config.hydra.launcher, 0, machine)
+        plan = estimated(plan, past, capacity.threads(len(plan), machine) or machine)
         if not self._brief:
-            self._say_plan(plan, past.known)
+            say(describe(plan), sys.stderr)
+            remarks = (*controls.mixed_prune_rules(plan), *unchanged(plan), without_kernels(plan))
+            for line in filter(None, (*remarks, expected_use(plan, past.known))):
+                log_line(line)
         if any(left_to_train(plan)) and (plan[0].conf.lpips.fetch or not self._brief):
             provide_lpips(fetch=plan[0].conf.lpips.fetch, dry_run=dry_run)
         if dry_run:
@@ -207,30 +193,13 @@ class Study:
             say(describe(plan), sys.stderr)
         return complete
 
-    @staticmethod
-    def _say_plan(plan: Sequence[PlannedCell], past: int) -> None:
-        """Say what the sweep will do, with estimates from `past` finished cells."""
-        say(describe(plan), sys.stderr)
-        remarks = (*controls.mixed_prune_rules(plan), *unchanged(plan), without_kernels(plan))
-        for line in filter(None, (*remarks, expected_use(plan, past))):
-            log_line(line)
-
-    def _threads(self, cells: int) -> int:
-        """Return the threads of a cell whose config sets no number of threads."""
-        launcher, machine = self._config.hydra.launcher, usable_cores()
-        return launchers.capacity(launcher, 0, machine).threads(cells, machine) or machine
-
     def _run_until_complete(
         self,
         plan: Sequence[PlannedCell],
         store: Store,
         watchers: Sequence[SweepMonitor | track.Tracker],
     ) -> list[PlannedCell]:
-        """Launch cells until none is left to do, here or in another sweep; return the final plan.
-
-        Raises:
-            StoreError: The store can't be written any more, or is no longer there.
-        """
+        """Launch cells until none is left to do, here or in another sweep; return the last plan."""
         conf = plan[0].conf
         waiting_said, tried = False, set[str]()
         launches = Launches(self._context, self._task, self._config)
@@ -244,8 +213,7 @@ class Study:
                 launches.end()
                 return list(plan)
             outcomes = launches.launch(to_train.values(), store) if to_train else {}
-            not_begun = {LOCKED, LOST}
-            begun = {cell_id for cell_id in to_train if outcomes[cell_id] not in not_begun}
+            begun = {i for i, outcome in outcomes.items() if outcome not in {LOCKED, LOST}}
             tried |= begun
             store.check_not_gone()
             plan = self._identified(plan, store)
@@ -264,12 +232,7 @@ class Study:
                 time.sleep(_POLL_S)
 
     def _plan(self, arguments: Sequence[str]) -> list[PlannedCell]:
-        """Return every cell of the command line; references come before count-matched cells.
-
-        Raises:
-            XrgsError: `matched_to` has no effect, or names a cell that is count-matched itself;
-                or `baseline=false` leaves no cell.
-        """
+        """Return every cell of the command line; references come before count-matched cells."""
         plan: dict[CellSpec, PlannedCell] = {}
         combinations = expand(arguments, self._context.config_loader)
         for spec in dict.fromkeys(map(self._with_effective_match, combinations)):
@@ -341,10 +304,9 @@ class Study:
 
 
 class Launches:
-    """The launches of one call of `xrgs-sweep`."""
+    """The launches of one call of `xrgs-sweep`; nothing is written before the first."""
 
     def __init__(self, context: HydraContext, task: TaskFunction, config: DictConfig) -> None:
-        """Prepare to launch, as `Study`; nothing is written before the first launch."""
         self._name = str(config.hydra.runtime.choices["hydra/launcher"])
         loader = cast("ConfigLoader", _JobConfigLoader())  # launchers call no other method
         self._context = HydraContext(loader, context.callbacks)
@@ -363,14 +325,14 @@ class Launches:
         session.begin()
         return session
 
+    def _set(self, key: str, value: Any) -> None:
+        with flag_override(self._config.hydra, ["readonly", "struct"], False):
+            OmegaConf.update(self._config.hydra, key, value)
+
     def end(self) -> None:
         """Tidy up after the last launch, whose jobs have all ended."""
         if self._session is not None:
             self._session.end()
-
-    def _set(self, key: str, value: Any) -> None:
-        with flag_override(self._config.hydra, ["readonly", "struct"], False):
-            OmegaConf.update(self._config.hydra, key, value)
 
     @property
     def stopped(self) -> str:
@@ -396,22 +358,17 @@ class Launches:
             allowed = launchers.one_cell_a_gpu(launcher, allowed, len(gpus()))
         for key, value in allowed.settings.items():
             self._set(f"launcher.{key}", value)
-        outcomes: dict[str, str] = {}
+        outcomes = {str(cell.cell_id): STOPPED for cell in cells}
         for batch in self._batches(cells, allowed.batch or len(cells)):
-            if session.stopped:
-                outcomes |= {str(cell.cell_id): STOPPED for cell in batch}
-                continue
-            outcomes |= self._launch_batch(batch, allowed.threads(len(batch), machine), store)
+            if not session.stopped:
+                outcomes |= self._launch_batch(batch, allowed.threads(len(batch), machine), store)
         return outcomes
 
     def _batches(self, cells: Sequence[PlannedCell], size: int) -> list[Sequence[PlannedCell]]:
         """Divide cells into batches. Cells that may have broken a launcher come last, one each."""
         others = [cell for cell in cells if cell.cell_id not in self._suspects]
-        suspects = [cell for cell in cells if cell.cell_id in self._suspects]
-        return [
-            *(others[start : start + size] for start in range(0, len(others), size)),
-            *([cell] for cell in suspects),
-        ]
+        batches = [others[start : start + size] for start in range(0, len(others), size)]
+        return [*batches, *([cell] for cell in cells if cell.cell_id in self._suspects)]
 
     def _launch_batch(
         self, cells: Sequence[PlannedCell], threads: int, store: Store
@@ -451,7 +408,7 @@ class Launches:
         state = store.cell(str(cell.cell_id)).state().name
         if state == "unfinished":
             return self._after_silence(str(cell.cell_id), state)
-        return "done" if state == "done" else "failed"
+        return state if state == "done" else "failed"
 
     def _after_silence(self, cell_id: str, state: str) -> str:
         """Return the outcome of a job without an answer, from the state of its cell."""
@@ -494,13 +451,9 @@ class _JobConfigLoader:
     """
 
     def load_sweep_config(self, master_config: DictConfig, overrides: list[str]) -> DictConfig:
-        """Return the sweep's `hydra` node with `cell` (its id), `store` and `name` of one job.
-
-        Raises:
-            XrgsError: The session's folder is no longer there. Hydra would make it again.
-        """
+        """Return the sweep's `hydra` node with `cell` (its id), `store` and `name` of one job."""
         folder = master_config.hydra.sweep.dir
-        if not SweepSession(Path(folder)).exists:
+        if not SweepSession(Path(folder)).exists:  # Hydra would make it again
             raise XrgsError(f"hydra.sweep.dir={folder} is no longer there")
         config = OmegaConf.masked_copy(master_config, ["hydra"])
         with flag_override(config, ["readonly", "struct"], False):
@@ -572,12 +525,7 @@ def _hand_over(cell: PlannedCell, threads: int, store: Store) -> list[str]:
 def provide_lpips(*, fetch: bool, dry_run: bool) -> None:
     """Fetch the weights of LPIPS where this machine has none, or say that LPIPS will be n/a.
 
-    Args:
-        fetch: `lpips.fetch`: whether they may be fetched.
-        dry_run: Only say what would be done.
-
-    Raises:
-        WeightsError: XRGS_LPIPS is set and names no file.
+    They are fetched where `lpips.fetch` allows it, and not in a dry run.
     """
     if weights.find_weights() is not None:
         return
