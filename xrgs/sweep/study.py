@@ -46,6 +46,7 @@ from xrgs.splat.backend import resolve_backend
 from xrgs.store.attempts import plan_cell
 from xrgs.store.store import Store, StoreGoneError
 from xrgs.sweep import controls, launchers, track
+from xrgs.sweep import plan as plans
 from xrgs.sweep.axes import CellSpec, effective, expand
 from xrgs.sweep.ending import ending
 from xrgs.sweep.estimate import CostEstimator
@@ -59,24 +60,7 @@ from xrgs.sweep.job import (
     unwritable,
 )
 from xrgs.sweep.monitor import SweepMonitor
-from xrgs.sweep.plan import (
-    PlannedCell,
-    check_sizes,
-    describe,
-    estimated,
-    expected_length,
-    expected_use,
-    identified,
-    left_to_train,
-    planned,
-    ready,
-    record,
-    unchanged,
-    will_fail,
-    with_variants,
-    with_wanted_baselines,
-    without_kernels,
-)
+from xrgs.sweep.plan import PlannedCell
 from xrgs.sweep.session import SweepSession
 
 if TYPE_CHECKING:
@@ -159,30 +143,31 @@ class Study:
         else:
             store.prepare()
             self._store = store
-        plan, notes = with_variants(plan, store, allow_build=not dry_run)
+        plan, notes = plans.with_variants(plan, store, allow_build=not dry_run)
         for line in () if self._brief else notes:
             log_line(line)
         plan = self._identified(plan, store)
         past, machine = CostEstimator(store), usable_cores()
         capacity = launchers.capacity(self._config.hydra.launcher, 0, machine)
-        plan = estimated(plan, past, capacity.threads(len(plan), machine) or machine)
+        plan = plans.estimated(plan, past, capacity.threads(len(plan), machine) or machine)
         if not self._brief:
-            say(describe(plan), sys.stderr)
-            remarks = (*controls.mixed_prune_rules(plan), *unchanged(plan), without_kernels(plan))
-            for line in filter(None, (*remarks, expected_use(plan, past.known))):
+            say(plans.describe(plan), sys.stderr)
+            remarks = (*controls.mixed_prune_rules(plan), *plans.unchanged(plan))
+            use = plans.expected_use(plan, past.known)
+            for line in filter(None, (*remarks, plans.without_kernels(plan), use)):
                 log_line(line)
-        if any(left_to_train(plan)) and (plan[0].conf.lpips.fetch or not self._brief):
+        if any(plans.left_to_train(plan)) and (plan[0].conf.lpips.fetch or not self._brief):
             provide_lpips(fetch=plan[0].conf.lpips.fetch, dry_run=dry_run)
         if dry_run:
-            return not will_fail(plan)
+            return not plans.will_fail(plan)
         _tidy({cell.cell_id for cell in plan if cell.cell_id and cell.state.name == "done"}, store)
         # At the start, so that a report can be made while it runs, and after it was stopped.
-        sweep_id = store.write_sweep(arguments, record(plan))
+        sweep_id = store.write_sweep(arguments, plans.record(plan))
         with track.Tracker(plan[0].conf.track, store) as tracker:
             with SweepMonitor(store.cells_folder, brief=self._brief) as monitor:
                 plan = self._run_until_complete(plan, store, [monitor, tracker])
             plan = [_without_reference(cell) for cell in plan]
-            store.write_sweep(arguments, record(plan), sweep_id)
+            store.write_sweep(arguments, plans.record(plan), sweep_id)
             from xrgs.report import build
 
             report = build(store.path, sweep_id)
@@ -190,7 +175,7 @@ class Study:
                 say(f"{report.text}\n\n{ending(plan, store.path)}".rstrip())
         complete = all(cell.error is None and cell.state.name == "done" for cell in plan)
         if self._brief and not complete:
-            say(describe(plan), sys.stderr)
+            say(plans.describe(plan), sys.stderr)
         return complete
 
     def _run_until_complete(
@@ -207,7 +192,7 @@ class Study:
             store.check_not_gone()
             for watcher in watchers:
                 watcher.watch(plan)
-            to_train = ready(plan, tried, retry=conf.retry == "failed")
+            to_train = plans.ready(plan, tried, retry=conf.retry == "failed")
             elsewhere = [cell for cell in plan if cell.state.name == "running"]
             if not to_train and not elsewhere:
                 launches.end()
@@ -236,15 +221,15 @@ class Study:
         plan: dict[CellSpec, PlannedCell] = {}
         combinations = expand(arguments, self._context.config_loader)
         for spec in dict.fromkeys(map(self._with_effective_match, combinations)):
-            cell = planned(spec, self._compose(spec))
+            cell = plans.planned(spec, self._compose(spec))
             if cell.reference is not None:
-                reference = planned(cell.reference, self._compose(cell.reference))
+                reference = plans.planned(cell.reference, self._compose(cell.reference))
                 controls.check_reference(cell, reference)
                 plan.setdefault(cell.reference, reference)
             plan.setdefault(cell.spec, cell)
         controls.check_effect(combinations, plan.values())
         scenes.check_labels(cell.conf.scene for cell in plan.values())
-        return with_wanted_baselines(list(plan.values()))
+        return plans.with_wanted_baselines(list(plan.values()))
 
     def _with_effective_match(self, spec: CellSpec) -> CellSpec:
         """Drop `matched_to` unless the ablation is count-matched."""
@@ -258,7 +243,7 @@ class Study:
         cells: dict[CellSpec, PlannedCell] = {}
         holders = lease.holders(store.leases)
         for earlier in plan:
-            cell = identified(self._with_count(earlier, cells, store), store, holders)
+            cell = plans.identified(self._with_count(earlier, cells, store), store, holders)
             cells[cell.spec] = cell
         return list(cells.values())
 
@@ -282,7 +267,7 @@ class Study:
         overrides = tuple(spec.overrides)
         if overrides not in self._confs:
             conf = to_conf(self._hydra_config(overrides))
-            check_sizes(conf)
+            plans.check_sizes(conf)
             self._confs[overrides] = conf
         return self._confs[overrides]
 
@@ -321,9 +306,8 @@ class Launches:
         """Create the session's folder, and give its full path to every job."""
         folder = _create_unique(user_path(self._config.hydra.sweep.dir).absolute(), store)
         self._set("sweep.dir", escape_interpolations(str(folder)))
-        session = SweepSession(folder)
-        session.begin()
-        return session
+        lease.sign(folder / "sweep")
+        return SweepSession(folder)
 
     def _set(self, key: str, value: Any) -> None:
         with flag_override(self._config.hydra, ["readonly", "struct"], False):
@@ -350,7 +334,7 @@ class Launches:
             XrgsError: The launcher can't be used, or begins no job; or the store is gone.
         """
         self._session = session = self._session or self._begin(store)
-        cells = sorted(cells, key=expected_length, reverse=True)
+        cells = sorted(cells, key=plans.expected_length, reverse=True)
         threads, machine = max(cell.conf.threads for cell in cells), usable_cores()
         launcher = self._config.hydra.launcher
         allowed = launchers.capacity(launcher, threads, machine)
