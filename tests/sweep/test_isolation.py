@@ -19,6 +19,8 @@ from typing import Any
 
 import pytest
 
+from xrgs.store.store import Store
+
 pytestmark = pytest.mark.slow
 
 #: (folder, faults) -> `tests.conftest.Sweeps`.
@@ -26,8 +28,7 @@ SweepsIn = Callable[..., Any]
 Ended = tuple[int, str, str]
 
 SMOKE = ("scene=motorcycle", "preset=smoke", "train.steps=4")
-#: A healthy cell writes results and ends; with a file `healed`, all are healthy. A report is made
-#: of the first sweep only.
+#: A healthy cell writes results and ends; with a file `healed`, all are healthy.
 FAULTS = """
 import sys
 if "xrgs.sweep.job" in sys.orig_argv and "cell" in sys.orig_argv:
@@ -77,7 +78,7 @@ if "xrgs.sweep.job" in sys.orig_argv and "cell" in sys.orig_argv:
 
     sys.modules["xrgs.store.cell"] = types.ModuleType("xrgs.store.cell")
     sys.modules["xrgs.store.cell"].run_cell = run_cell
-elif "seed=1,2,3,5,0" not in sys.orig_argv:
+else:  # no report is made, which takes as long as all else
     import types
     sys.modules["xrgs.report"] = types.ModuleType("xrgs.report")
     sys.modules["xrgs.report"].build = lambda *_: types.SimpleNamespace(text="")
@@ -117,7 +118,7 @@ def stopped(
 ) -> tuple[Any, dict[str, Ended]]:
     """On another copy, sweeps that did not come to their end, and what they said of it.
 
-    One found the disk full; others had a signal while a cell hung, which `seen` was looked at.
+    One found the disk full; others had a signal while a cell hung.
     """
     sweeps = sweeps_in(tmp_path_factory.mktemp("stopped"), FAULTS)
     shutil.copytree(built[0].folder / "s", sweeps.folder / "s")
@@ -125,9 +126,6 @@ def stopped(
     for number in (signal.SIGINT, signal.SIGKILL):
         sweep = sweeps.start(*SMOKE, "seed=4")
         wait_for(sweeps.folder / "hangs", sweep.process)
-        if number == signal.SIGKILL:
-            told["seen"] = sweeps.start(*SMOKE, "seed=4", "dry_run=true").end()
-            assert f"by process {sweep.process.pid} on" in told["seen"][2]
         sweep.process.send_signal(number)
         told[number.name] = sweep.end()
         sweeps.leave_nothing_running()
@@ -144,7 +142,7 @@ def wait_for(file: Path, process: subprocess.Popen[bytes]) -> None:
 
 
 def test_each_fault_is_its_cell_s_status_and_the_others_finish(built: tuple[Any, Ended]) -> None:
-    sweeps, (code, out, err) = built
+    sweeps, (code, _, err) = built
     assert code == 1, err
     found = sweeps.cells()
     assert status(found[0])["state"] == "done"
@@ -160,10 +158,8 @@ def test_each_fault_is_its_cell_s_status_and_the_others_finish(built: tuple[Any,
         assert reason in (found[seed] / "error.txt").read_text()
         assert (found[seed] / "log.txt").is_file()
         assert reason in err
-        assert reason.partition(":")[0] in out  # the table says why too
     assert "Traceback" in (found[1] / "log.txt").read_text()
     assert "Segmentation fault" in (found[3] / "log.txt").read_text()
-    assert out.count("failed") >= 4
     assert not list((sweeps.folder / "s" / "locks").iterdir())
 
 
@@ -212,7 +208,6 @@ def test_a_killed_sweep_is_taken_over_and_two_at_once_train_each_cell_once(
     """What was stopped and what a full disk had no room for, in one go."""
     sweeps, told = stopped
     assert told["SIGKILL"][0] == -signal.SIGKILL
-    assert "running" in told["seen"][2]
     assert [file.name for file in (sweeps.folder / "s" / "locks").iterdir()] == [
         f"{sweeps.cells()[4].name}.0"
     ]
@@ -233,8 +228,8 @@ def test_a_killed_sweep_is_taken_over_and_two_at_once_train_each_cell_once(
     assert not list((sweeps.folder / "s" / "locks").iterdir())
 
 
-#: In a mount namespace of its own: the store moves to a small disk, which has hardly any room, then
-#: can't be written, and then has room.
+#: In a mount namespace of its own: the store moves to a small disk, which has hardly any room, and
+#: then can't be written.
 _SMALL_DISK = """
 import os, shutil, subprocess, sys
 
@@ -256,10 +251,7 @@ with open("s/filler", "wb") as filler:
 call("tight", *sys.argv[1:], "seed=8,9,0")
 mount("remount,ro")
 call("read-only", *sys.argv[1:], "seed=8,9,0")
-mount("remount,rw")
-os.unlink("s/filler")
-call("room", *sys.argv[1:], "seed=8,9,0", "dry_run=true")
-shutil.copytree("s", "after")
+shutil.copytree("s", "after", ignore=shutil.ignore_patterns("filler"))
 """
 
 
@@ -288,10 +280,8 @@ def test_a_disk_that_takes_no_more_is_said_and_loses_nothing(sweeps: Any) -> Non
         assert "store=s" in err
         assert "Traceback" not in err
         assert "Finished cells are kept" in err or "choose another with store=" in err
-    code, plan = told["room"]
-    assert code == "0"
-    assert "3 cells, 1 done" in plan
-    assert "failed " not in plan
-    healthy = sweeps.folder / "before" / "cells"
-    for cell in healthy.iterdir():
-        assert files(sweeps.folder / "after" / "cells" / cell.name).keys() == files(cell).keys()
+    before, after = (Store(sweeps.folder / name).cell_folders() for name in ("before", "after"))
+    states = {cell.id: cell.state().name for cell in after}
+    for cell in before:
+        assert states.pop(cell.id) == cell.state().name
+    assert set(states.values()) <= {"planned", "unfinished"}  # those are trained again

@@ -61,10 +61,10 @@ def folder(smoke_variants: Path, tmp_path: Path) -> Path:
     return tmp_path
 
 
-def check(folder: Path) -> None:
-    """Assert that both cells are done, and had one core of two each."""
+def done(folder: Path) -> list[int]:
+    """The threads of the cells that are done."""
     cells = Store(folder / "s").cell_folders()
-    assert [(cell.state().name, cell.config().threads) for cell in cells] == [("done", 1)] * 2
+    return [cell.config().threads for cell in cells if cell.state().name == "done"]
 
 
 @pytest.mark.parametrize(
@@ -85,7 +85,7 @@ def test_a_launcher_runs_two_cells_at_once(
         pytest.skip(f"pip install 'xrgs[{package}]', which is large")
     code, _, err = sweeps_in(folder, SITE).run(*SMOKE, f"hydra/launcher={launcher}", *settings)
     assert code == 0, err
-    check(folder)
+    assert done(folder) == [1, 1]  # of two cores
 
 
 def test_joblib_runs_two_cells_at_once_and_a_killed_worker_costs_nothing(
@@ -100,4 +100,4 @@ def test_joblib_runs_two_cells_at_once_and_a_killed_worker_costs_nothing(
     assert "of its 2 cells these are not finished:" in err
     # Both begin and both begin again; the pool may break before the second has begun.
     assert err.count("training cell") in (3, 4)
-    check(folder)
+    assert len(done(folder)) == 2

@@ -57,15 +57,18 @@ def export(path: Path, layout: str, out: Path) -> str:
     if layout not in _LAYOUTS:
         raise XrgsError(f"format={layout}: must be one of {', '.join(_LAYOUTS)}")
     from xrgs.formats.ply import save_ply
+    from xrgs.mixture import variant
+    from xrgs.training import dataset
 
     cell = _cell(path)
-    variant, data = _load(path, cell)
+    frozen = variant.load(path) if cell is None else cell.variant()
+    data = dataset.load(frozen) if cell is None else cell.dataset()
     try:
         out.mkdir(parents=True, exist_ok=True)
         if any(out.iterdir()):
             raise XrgsError(f"out={out}: is not empty; name a new folder")
         images = _write_images(data, out)
-        write_json(out / "transform.json", {"sfm_to_export": transform(variant).tolist()})
+        write_json(out / "transform.json", {"sfm_to_export": transform(frozen).tolist()})
         _LAYOUTS[layout](data, images, out)
         if cell is not None:
             # Not a copy: cells of older versions have no tag of antialiased Gaussians.
@@ -167,16 +170,6 @@ def _cell(folder: Path) -> CellFolder | None:
     if state.name != "done":
         raise XrgsError(f"{folder}: this cell is {state.name}, not done ({state.reason})")
     return cell
-
-
-def _load(folder: Path, cell: CellFolder | None) -> tuple[Variant, Dataset]:
-    from xrgs.mixture import variant
-    from xrgs.training import dataset
-
-    if cell is not None:
-        return cell.variant(), cell.dataset()
-    frozen = variant.load(folder)
-    return frozen, dataset.load(frozen)
 
 
 def _views(data: Dataset) -> Iterator[tuple[str, str, LoadedView]]:

@@ -54,15 +54,6 @@ def _instruction_set(backend: str) -> str | None:
     return str(_native.isa())
 
 
-def _gpu(backend: str) -> str | None:
-    """Return the name of the GPU that trains; None where the backend uses none."""
-    if device(backend) != "cuda":
-        return None
-    import torch
-
-    return torch.cuda.get_device_name()
-
-
 def collect(threads: int, backend: str) -> Provenance:
     """Return the program, its libraries, the machine and the time.
 
@@ -75,7 +66,11 @@ def collect(threads: int, backend: str) -> Provenance:
             can't be scored is better stopped here than after its training.
         XrgsError: The backend is not available on this machine.
     """
-    built_from = _commit()
+    built_from, gpu = _commit(), None
+    if device(backend) == "cuda":
+        import torch
+
+        gpu = torch.cuda.get_device_name()
     published = weights.load_published()
     return Provenance(
         xrgs=xrgs.__version__,
@@ -91,7 +86,7 @@ def collect(threads: int, backend: str) -> Provenance:
         lpips_weights_sha256=None if published is None else weights.CONTENT_SHA256,
         started=datetime.now(UTC).isoformat(timespec="seconds"),
         cpu=_cpu(),
-        gpu=_gpu(backend),
+        gpu=gpu,
         instruction_set=_instruction_set(backend),
     )
 

@@ -25,7 +25,6 @@ from xrgs.store import trimming
 from xrgs.store.inspect import read_report
 from xrgs.store.store import StoreGoneError
 from xrgs.sweep import job
-from xrgs.sweep.job import Limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -79,7 +78,7 @@ def build(
         work = "finding the cameras" if conf.variant.poses is None else "reading the cameras"
     log_line(f"{scenes.label(conf.scene)}: {work}{place}")
     request = {"conf": asdict(conf), "store": str(store.path)}
-    answer = job.run_in_child("variant", request, Limits(), on_poll, environment)
+    answer = job.run_in_child("variant", request, None, on_poll, environment)
     return str(answer["variant"])
 
 

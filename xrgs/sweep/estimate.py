@@ -86,11 +86,13 @@ class CostEstimator:
         """Read the newest finished cells; a cell that can't be read is left out."""
         self._store = store
         self._finished: list[_Finished] = []
-        for cell in _newest(store):
-            try:
+        newest: list[CellFolder] = []
+        with suppress(OSError, StoreError):
+            cells = [cell for cell in store.cell_folders() if cell.status_file.exists()]
+            newest = heapq.nlargest(_MAX_CELLS, cells, key=lambda cell: cell.path.stat().st_mtime)
+        for cell in newest:
+            with suppress(XrgsError, OSError, ValueError):
                 self._finished.append(self._read(cell))
-            except (XrgsError, OSError, ValueError):
-                continue
 
     @property
     def known(self) -> int:
@@ -221,11 +223,3 @@ def units_of_a_step(store: Store, conf: Conf, variant_id: str) -> float:
     """Return the pixels and the Gaussians of a step of a cell, mean over the steps."""
     mean, largest = _pixels(store.variants, variant_id, conf)
     return mean + GAUSSIANS_OF_A_PIXEL * largest
-
-
-def _newest(store: Store) -> list[CellFolder]:
-    try:
-        cells = [cell for cell in store.cell_folders() if cell.status_file.exists()]
-        return heapq.nlargest(_MAX_CELLS, cells, key=lambda cell: cell.path.stat().st_mtime)
-    except (OSError, StoreError):
-        return []

@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 
     from omegaconf import DictConfig
 
-    from xrgs.config import Conf
+    from xrgs.config import Conf, LimitsConf
     from xrgs.store.schema import Identity
 
 #: Outcomes of a job other than the states of a cell. LOCKED: another process trains the cell.
@@ -86,20 +86,6 @@ _STACK_SIGNAL = signal.SIGUSR1
 #: Waits for the end of its standard input, a pipe into which nothing is written, and then kills the
 #: process group. It ignores the signals that ask the group to end.
 _WATCHER = "trap '' TERM INT HUP; read -r _; kill -s KILL -- -$1"
-
-
-@dataclass(frozen=True)
-class Limits:
-    """Limits of a process and all its children; 0 means no limit."""
-
-    minutes: float = 0.0
-    """Wall time, minutes."""
-    memory_gb: float = 0.0
-    """Resident memory of all processes together, in 10^9 bytes, read every 0.2 s. RLIMIT_AS is no
-    substitute: torch alone maps several times the memory that it uses."""
-
-
-_NO_LIMITS = Limits()
 
 
 @dataclass(frozen=True)
@@ -272,11 +258,10 @@ def _train_in_child(
         if session.owner_dead:
             raise WorkError("its sweep's process has ended", STOPPED)
 
-    limits = Limits(conf.limits.minutes, conf.limits.memory_gb)
     try:
         request = cell_request(variant, cell)
         with _own_gpu(session, conf.splat.backend) as environment:
-            answer = run_in_child("cell", request, limits, on_poll, environment)
+            answer = run_in_child("cell", request, conf.limits, on_poll, environment)
     except XrgsError as error:
         return _after_error(error, store, cell, held)
     for line in () if session.brief else answer["found"]:
@@ -343,13 +328,13 @@ def restore_images(conf: Conf, store: Store, variant_id: str) -> None:
         return
     log_line(f"variant {variant_id}: making the images again that xrgs-store trim has removed")
     request = {"conf": asdict(conf), "store": str(store.path), "variant": variant_id}
-    run_in_child("variant", request, _NO_LIMITS, lambda _: store.check_not_gone())
+    run_in_child("variant", request, None, lambda _: store.check_not_gone())
 
 
 def run_in_child(
     work: str,
     request: Mapping[str, Any],
-    limits: Limits = _NO_LIMITS,
+    limits: LimitsConf | None = None,
     on_poll: Callable[[int], None] = lambda _: None,
     environment: Mapping[str, str] = MappingProxyType({}),
 ) -> dict[str, Any]:
@@ -409,7 +394,7 @@ def _death(code: int) -> WorkError:
 
 def run_supervised(
     command: Sequence[str],
-    limits: Limits,
+    limits: LimitsConf | None = None,
     on_poll: Callable[[int], None] = lambda _: None,
     environment: Mapping[str, str] = MappingProxyType({}),
 ) -> ProcessEnd:
@@ -430,20 +415,22 @@ def run_supervised(
     return ProcessEnd(child.returncode, reason)
 
 
-def _watch(child: subprocess.Popen[bytes], limits: Limits, on_poll: Callable[[int], None]) -> str:
-    """Wait until the child ends or exceeds a limit; return which limit, or nothing."""
+def _watch(
+    child: subprocess.Popen[bytes], limits: LimitsConf | None, on_poll: Callable[[int], None]
+) -> str:
+    """Wait until the child ends or exceeds a limit; return which limit, or nothing.
+
+    RLIMIT_AS is no substitute: torch alone maps several times the memory that it uses.
+    """
+    minutes, memory_gb = (limits.minutes, limits.memory_gb) if limits else (0.0, 0.0)
     start, pause = time.monotonic(), 0.01
     while child.poll() is None:
-        minutes = (time.monotonic() - start) / 60
-        if limits.minutes and minutes > limits.minutes:
-            return f"it took longer than limits.minutes={limits.minutes:g} and was ended"
-        if (
-            limits.memory_gb
-            and (used := processes.resident_bytes(child.pid) / 1e9) > limits.memory_gb
-        ):
+        if minutes and time.monotonic() - start > 60 * minutes:
+            return f"it took longer than limits.minutes={minutes:g} and was ended"
+        if memory_gb and (used := processes.resident_bytes(child.pid) / 1e9) > memory_gb:
             return (
-                f"out of memory: it used {used:.2f} GB, more than "
-                f"limits.memory_gb={limits.memory_gb:g}, and was ended"
+                f"out of memory: it used {used:.2f} GB, more than limits.memory_gb={memory_gb:g},"
+                " and was ended"
             )
         on_poll(child.pid)
         time.sleep(pause)

@@ -97,7 +97,13 @@ def rerun(
     try:
         conf, added = _read(original)
         _check_plugins_allowed(original, conf, plugins)
-        home = Store(store or _store_of(folder))
+        cells = folder.absolute().parent  # not resolved: `cells` may be a link to another disk
+        if store is None and cells.name != "cells":
+            raise XrgsError(
+                f"rerun={folder} is not in a store; name the store that has its variant with"
+                " store=..."
+            )
+        home = Store(store or cells.parent)
         conf.threads = original.provenance().threads if threads is None else threads
         conf.scene.path = photographs or conf.scene.path
         if conf.threads < 0:
@@ -173,15 +179,6 @@ def _changes(then: Any, now: Any, name: str) -> Iterator[str]:
     elif then != now:
         before, after = (for_line(str(value), _MAX_VALUE) for value in (then, now))
         yield f"{name}: {before} -> {after}"
-
-
-def _store_of(folder: Path) -> Path:
-    cells = folder.absolute().parent  # not resolved: `cells` may be a link to another disk
-    if cells.name != "cells":
-        raise XrgsError(
-            f"rerun={folder} is not in a store; name the store that has its variant with store=..."
-        )
-    return cells.parent
 
 
 def _provide(variant_id: str, conf: Conf, store: Store) -> None:

@@ -139,7 +139,7 @@ class Study:
         store = Store(Path(plan[0].conf.store))
         dry_run = plan[0].conf.dry_run
         if dry_run:
-            store.check_writable()
+            store.check_room()
         else:
             store.prepare()
             self._store = store

@@ -61,7 +61,11 @@ def curves(cell: CellFolder, *, done: bool) -> Curves:
     quality = cell.path / "quality.csv"
     rows = [*history, *(_table(quality, "quality") if quality.is_file() else ())]
     if done:
-        rows.append(_scores(cell))
+        from xrgs.store.results import cell_metrics  # pandas is slow to load
+
+        summary = cell.summary()
+        scores = cell_metrics(summary, cell.scores())
+        rows.append((summary.steps, {f"score/{name}": score for name, score in scores.items()}))
     else:
         rows = [(step, values) for step, values in rows if step <= history[-1][0]]
     by_step: Curves = {}
@@ -80,15 +84,6 @@ def _table(file: Path, group: str) -> list[tuple[int, dict[str, float]]]:
         (int(row["step"]), {f"{group}/{name}": as_number(row[name]) for name in others})
         for row in table
     ]
-
-
-def _scores(cell: CellFolder) -> tuple[int, dict[str, float]]:
-    """Return the number of steps of a finished cell, and its scores."""
-    from xrgs.store.results import cell_metrics  # pandas is slow to load
-
-    summary = cell.summary()
-    metrics = cell_metrics(summary, cell.scores())
-    return summary.steps, {f"score/{name}": value for name, value in metrics.items()}
 
 
 def run_of(planned: PlannedCell, cell: CellFolder) -> Run:
