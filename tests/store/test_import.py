@@ -262,8 +262,9 @@ def test_a_record_that_has_changed_or_is_of_no_type_is_left_out(
     file = foreign.sweeps / f"{sweep_id}.json"
     file.write_text(file.read_text().replace('"baseline"', '"best"'))
     (foreign.sweeps / ("0" * 16 + ".json")).write_text('{"version": 1, "command": 3}')
-    code, said, _ = call_command("store", "import", str(foreign.path), "--store", "mine")
+    code, out, err = call_command("store", "import", str(foreign.path), "--store", "mine")
     assert code == 1
+    said = out + err
     assert said.count("imported: 1 cell, 1 variant, 1 rendered scene, 0 records") == 1
     assert "command: Expected `array`" in said
     assert "its cells have changed" in said

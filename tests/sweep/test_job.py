@@ -202,14 +202,12 @@ def test_what_components_found_is_said_and_a_brief_job_that_is_done_says_nothing
 def test_a_cell_ends_with_its_sweep_and_is_unfinished(
     session: SweepSession, cells: Cells, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def train(
-        _: str, __: object, ___: object, on_poll: Callable[[int], None], *____: object
-    ) -> None:
+    def train(on_poll: Callable[[int], None]) -> None:
         on_poll(0)
         monkeypatch.setattr(lease.Owner, "lives", False)
         on_poll(0)
 
-    monkeypatch.setattr(job_module, "run_in_child", train)
+    monkeypatch.setattr(job_module, "run_in_child", lambda *given: train(given[3]))
     cell = cells.plan()
     assert run(session, cells, cell.id) == STOPPED
     assert cell.state().name == "unfinished"
@@ -256,9 +254,7 @@ def test_a_job_whose_lease_was_taken_over_writes_nothing_from_then_on(
             content(cells.store.path / "locks"),
         )
 
-    def train(
-        _: str, __: object, ___: object, on_poll: Callable[[int], None], *____: object
-    ) -> None:
+    def train(on_poll: Callable[[int], None]) -> None:
         assert end != "before it begins"
         on_poll(0)
         lose()
@@ -267,7 +263,7 @@ def test_a_job_whose_lease_was_taken_over_writes_nothing_from_then_on(
         assert not held[-1].beat()  # as its thread does
         on_poll(0)
 
-    monkeypatch.setattr(job_module, "run_in_child", train)
+    monkeypatch.setattr(job_module, "run_in_child", lambda *given: train(given[3]))
     if end == "before it begins":
         monkeypatch.setattr(job_module, "_check_code", lose)
     assert run(session, cells, cell_id) == LOCKED
@@ -351,9 +347,7 @@ def test_a_store_that_vanishes_while_a_cell_trains_does_not_reappear(
     how: str,
     seen: str,
 ) -> None:
-    def train(
-        _: str, __: object, ___: object, on_poll: Callable[[int], None], *____: object
-    ) -> None:
+    def train(on_poll: Callable[[int], None]) -> None:
         on_poll(0)
         cells.store.path.rename(tmp_path / "moved")
         if how == "deleted":
@@ -364,7 +358,7 @@ def test_a_store_that_vanishes_while_a_cell_trains_does_not_reappear(
             raise WorkError("FileNotFoundError: no such file")
         on_poll(0)
 
-    monkeypatch.setattr(job_module, "run_in_child", train)
+    monkeypatch.setattr(job_module, "run_in_child", lambda *given: train(given[3]))
     assert run(session, cells, cells.plan(fail_fast=True).id) == GONE
     assert "moved" not in capsys.readouterr().err  # the sweep says it once
     if how == "unmounted":

@@ -66,9 +66,9 @@ def test_a_last_cell_has_the_machine_to_itself(composed: Callable[..., DictConfi
     assert (allowed.at_once, allowed.threads(1000, machine=8)) == (8, 1)
     assert allowed.threads(1, machine=8) == 8
     assert allowed.threads(3, machine=8) == 2
-    launcher.n_jobs = 0
+    none = composed("hydra/launcher=joblib", "hydra.launcher.n_jobs=0").hydra.launcher
     with pytest.raises(XrgsError, match="n_jobs=0"):
-        capacity(launcher, 0, machine=8)
+        capacity(none, 0, machine=8)
 
 
 def test_a_launcher_that_is_not_installed_is_named_with_its_extra(
