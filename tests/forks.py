@@ -73,7 +73,7 @@ class _Handler(socketserver.StreamRequestHandler):
 
         def run_supervised(
             command: Sequence[str],
-            limits: job.Limits,
+            limits: object,
             on_poll: Callable[[int], None] = lambda _: None,
             environment: Mapping[str, str] = MappingProxyType({}),
         ) -> job.ProcessEnd:

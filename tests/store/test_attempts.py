@@ -62,20 +62,28 @@ def test_a_new_attempt_is_on_the_disk_before_it_has_the_name_of_the_old_one(
     ]
 
 
-def test_what_is_set_aside_keeps_its_name_on_the_disk(
-    done: CellFolder, disk_events: list[str]
-) -> None:
-    (done.path / "scores.csv").write_text("view\n")
-    assert begin_attempt(done)
-    assert steps(disk_events)[-2:] == ["rename .abc.old to abc.aside-1", "sync cells"]
-
-
 def test_a_cell_killed_before_its_first_checkpoint_leaves_no_folder_aside(tmp_path: Path) -> None:
     folder = begun(CellFolder(tmp_path / "cells" / "abc"))
     (folder.path / "splats.ply").write_text("of the attempt that was killed")
-    begun(folder)
+    (tmp_path / "mine").write_text("kept")
+    (folder.path / "linked").symlink_to(tmp_path / "mine")
+    with (folder.path / "log.txt").open("ab") as log:  # its process still writes
+        log.write(b"before")
+        log.flush()
+        begun(folder)
+        log.write(b"after")
+    assert (folder.path / "log.txt").read_text() == "before"
     assert list_names(folder.path) == BEGUN
     assert list_names(folder.path.parent) == ["abc"]
+    assert (tmp_path / "mine").read_text() == "kept"
+
+
+def test_a_corrupt_cell_is_set_aside(done: CellFolder, disk_events: list[str]) -> None:
+    (done.path / "scores.csv").write_text("view\n")
+    assert begin_attempt(done)
+    assert list_names(done.path) == BEGUN
+    assert (done.path.with_name("abc.aside-1") / "scores.csv").read_text() == "view\n"
+    assert steps(disk_events)[-2:] == ["rename .abc.old to abc.aside-1", "sync cells"]
 
 
 def test_a_failed_cell_without_checkpoint_is_set_aside_with_its_error(tmp_path: Path) -> None:
@@ -86,22 +94,6 @@ def test_a_failed_cell_without_checkpoint_is_set_aside_with_its_error(tmp_path: 
         assert folder.state().name == "unfinished"
         error = folder.path.with_name(f"abc.aside-{aside}") / "error.txt"
         assert error.read_text() == f"out of luck {aside}\n"
-
-
-def test_a_corrupt_cell_is_set_aside(done: CellFolder) -> None:
-    (done.path / "scores.csv").write_text("view\n")
-    begun(done)
-    assert list_names(done.path) == BEGUN
-    assert (done.path.with_name("abc.aside-1") / "scores.csv").read_text() == "view\n"
-
-
-def test_what_a_link_points_to_is_not_cleared(stopped: CellFolder, tmp_path: Path) -> None:
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "file").write_text("kept")
-    (stopped.path / "linked").symlink_to(tmp_path / "mine")
-    begun(stopped)
-    assert not (stopped.path / "linked").exists()
-    assert (tmp_path / "mine" / "file").read_text() == "kept"
 
 
 def test_a_process_that_lost_its_cell_writes_into_its_own_attempt_alone(
@@ -119,16 +111,6 @@ def test_a_process_that_lost_its_cell_writes_into_its_own_attempt_alone(
     assert first.state().name == "failed"
     assert folder.state().name == "unfinished"
     assert list_names(folder.path) == BEGUN
-
-
-def test_a_log_that_is_still_written_to_is_not_the_log_of_the_next_attempt(tmp_path: Path) -> None:
-    folder = begun(CellFolder(tmp_path / "cells" / "abc"))
-    with (folder.path / "log.txt").open("ab") as log:
-        log.write(b"before")
-        log.flush()
-        begun(folder)
-        log.write(b"after")
-    assert (folder.path / "log.txt").read_text() == "before"
 
 
 def test_a_process_that_lost_the_lease_meanwhile_changes_nothing(

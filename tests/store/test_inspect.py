@@ -6,14 +6,11 @@ import errno
 import json
 import os
 import re
-import resource
 import shutil
-import zlib
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -81,44 +78,8 @@ def test_views_that_are_not_placed_are_named_by_what_they_lack() -> None:
     report.tests = 1
     assert report.all_notes()[1:] == (f"{unscored}v0, v1, v2, v3, v4, v5 and 3 more",)
     assert report.all_notes(9)[1].endswith("v7, v8")
-
-
-def test_of_a_scene_that_failed_the_notes_are_all_there_is() -> None:
+    # A scene that failed, whose reason names the views.
     assert SfmReport(notes=("n",), not_registered=("a",)).all_notes() == ("n",)
-
-
-@pytest.mark.slow
-def test_a_variant_is_described_and_drawn(
-    xrgs_data: Run, tmp_path: Path, smoke_variants: Path
-) -> None:
-    shutil.copytree(smoke_variants, tmp_path / "s" / "variants")
-    arguments = ("scene=motorcycle", "preset=smoke", "store=s", "--out", "sheet.png")
-    code, out, err = xrgs_data("inspect", *arguments)
-    assert code == 0, err
-    for text in ("motorcycle_left", "motorcycle_right", "250 x 165", "50 x 33", "2 of 2 views"):
-        assert text in out
-    drawn = (tmp_path / "sheet.png").read_bytes()
-    folder = next((tmp_path / "s" / "variants").glob("[!.]*"))
-    code, again, err = xrgs_data("inspect", str(folder.relative_to(tmp_path)), "--out", "sheet.png")
-    assert code == 0, err
-    assert again == out
-    assert (tmp_path / "sheet.png").read_bytes() == drawn
-
-    code, out, err = xrgs_data("inspect", *arguments[:-1], "no/sheet.png")
-    assert code == 1
-    assert "--out no/sheet.png: can't be written" in err
-    image = next(folder.rglob("motorcycle_left.png"))
-    image.write_bytes(image.read_bytes()[:-1])
-    code, out, err = xrgs_data("inspect", str(folder))
-    assert code == 1
-    assert "motorcycle_left.png: it has changed since it was written" in err
-    (folder / "variant.json").unlink()
-    code, out, err = xrgs_data("inspect", str(folder))
-    assert code == 1
-    assert out == ""
-    # Without its manifest it is a folder of photographs, and has none at the top.
-    assert f"scene.path={folder}" in err
-    assert "takes the images of all folders" in err
 
 
 def test_a_sheet_that_can_not_be_written_here_says_how_to_name_another(
@@ -182,7 +143,6 @@ NEEDS = "sampling rates of training views differ by 1.1 where they show the same
     [
         (1, "none", (MEANINGLESS, NEEDS, "left out: a.gif"), False, ("left out: a.gif",)),
         (1, "none", (NEEDS,), True, ()),  # a mixture
-        (1, "jpeg", (NEEDS,), True, (NEEDS,)),
         (2, "none", (MEANINGLESS, NEEDS), True, (MEANINGLESS, NEEDS)),  # a study asks for LR views
     ],
 )
@@ -225,7 +185,6 @@ def test_photographs_as_they_are_are_described_without_a_split(
 @pytest.mark.parametrize(
     ("needs", "said"),
     [
-        ([1.0, 1.2, 1.4, 1.45], r"^hardly a mixture: 0 of 4 .*tuned_baseline"),
         ([1.0, 1.0, 1.0, 1.0, 3.0], r"^hardly a mixture: 1 of 5 .*tuned_baseline"),
         ([1.0, 1.0, 1.0, 1.6], r"^a mixture: 1 of 4 .*plus"),
     ],
@@ -279,87 +238,55 @@ def test_a_failed_variant_says_what_was_tried(tmp_path: Path) -> None:
     assert "position" not in text
     (folder / "report.json").write_text("{}")
     assert "0 of ? views" in describe(folder)
+    (folder / "report.json").write_text('{"attempts": [1]}')
+    with pytest.raises(XrgsError, match=r"damaged: \S+report\.json: attempts\[0\]"):
+        describe(folder)
     shutil.rmtree(folder)
     for path in (folder, folder / "inside"):
         with pytest.raises(XrgsError, match=f"{path}: no such folder"):
             describe(path)
 
 
-def test_borders_tell_the_tag(mixed: Variant) -> None:
-    found = tiles(contact_sheet(mixed)[0])
-    assert [tile[1, 1].tolist() for tile in found] == [
+def test_the_sheet_shows_each_view_in_its_colour_and_its_centre_pixel_by_pixel(
+    mixed: Variant,
+) -> None:
+    names = ("x" * 200, "фото 写真", "")  # too long for a tile, or of another script
+    views = tuple(replace(v, name=n) for v, n in zip(mixed.views[1:], names, strict=True))
+    size = contact_sheet(replace(mixed, views=views, scene="a\nb\x1b" + "s" * 500))[0].size
+    sheet, _ = contact_sheet(mixed)
+    assert sheet.size == size
+    high, low, held_out = tiles(sheet)
+    assert [tile[1, 1].tolist() for tile in (high, low, held_out)] == [
         rgb(COLOURS[k]) for k in ("HR", "LR", "test")
     ]
-
-
-def test_the_centre_shows_the_pixels_as_they_are(mixed: Variant) -> None:
-    high, low, _ = tiles(contact_sheet(mixed)[0])
-    whole = np.asarray(Image.open(mixed.views[2].file))
-    assert np.array_equal(high[4:196, 264:456], whole[54:246, 104:296])
+    whole = Image.open(mixed.views[2].file)
+    shrunk = np.asarray(whole.resize((256, 192), Image.Resampling.BOX))
+    assert np.array_equal(high[4:196, 4:260], shrunk)
+    assert np.array_equal(high[4:196, 264:456], np.asarray(whole)[54:246, 104:296])
     small = np.asarray(Image.open(mixed.views[3].file))
     centre = low[4:196, 264:456]
     for k in range(5):  # each pixel a square of 5
         block = centre[k::5, k::5]
         assert np.array_equal(block, small[10:, 20:][: len(block), : len(block)])
-
-
-def test_a_small_view_is_magnified_and_a_large_one_shrunk(mixed: Variant) -> None:
-    high, low, _ = tiles(contact_sheet(mixed)[0])
-    whole = np.asarray(Image.open(mixed.views[2].file).resize((256, 192), Image.Resampling.BOX))
-    assert np.array_equal(high[4:196, 4:260], whole)
     shown = {tuple(pixel) for pixel in low[4:196, 4:260].reshape(-1, 3).tolist()}
-    stored = {tuple(p) for p in np.asarray(Image.open(mixed.views[3].file)).reshape(-1, 3).tolist()}
-    assert shown == stored  # no pixel is blended with another
+    assert shown == {tuple(pixel) for pixel in small.reshape(-1, 3).tolist()}  # none is blended
 
 
-def test_names_that_are_too_long_or_of_another_script_are_drawn(
-    mixed: Variant, tmp_path: Path
-) -> None:
-    names = ("x" * 200, "фото 写真", "")
-    views = tuple(replace(v, name=n) for v, n in zip(mixed.views[1:], names, strict=True))
-    sheet = contact_sheet(replace(mixed, views=views, scene="s" * 500))[0]
-    assert sheet.size == contact_sheet(mixed)[0].size
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("damage", "why"),
-    [
-        ("gone", "No such file or directory"),
-        ("a JPEG", "cannot identify"),
-        ("truncated", "truncated"),
-        ("another size", "it has 13000 x 13000 pixels"),
-        ("too few bytes", "bytes are too few for 400 x 300 px"),
-        ("too large", "at most"),
-    ],
-)
 def test_one_image_that_cant_be_read_does_not_take_the_sheet(
-    mixed: Variant, damage: str, why: str
+    mixed: Variant, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    view, file = mixed.views[2], mixed.views[2].file
-    content = file.read_bytes()
-    file.unlink()
-    if damage == "a JPEG":
-        Image.new("RGB", (400, 300)).save(file, "JPEG")
-    elif damage == "truncated":
-        file.write_bytes(content[: len(content) // 2])
-    elif damage in {"another size", "too large"}:
-        file.write_bytes(flat_png(13_000, 13_000))
-    elif damage == "too few bytes":
-        file.write_bytes(flat_png(400, 300)[:200])
-    if damage == "too large":
-        view = replace(view, width=13_000, height=13_000)
-    views = (*mixed.views[:2], view, mixed.views[3])
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    sheet, notes = contact_sheet(replace(mixed, views=views))
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000  # kB
+    file = mixed.views[2].file
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    sheet, notes = contact_sheet(mixed)
     assert len(notes) == 1
     assert str(file) in notes[0]
-    assert why in notes[0]
+    assert "truncated" in notes[0]
     high, low, held_out = tiles(sheet)
     assert len(np.unique(high[4:196, 4:456])) > 1  # it says so
     assert held_out[4:196, 4:260].std() > 20  # the others are drawn as ever
     assert low[4:196, 4:260].std() > 20
+    monkeypatch.setattr("xrgs.store.contact_sheet._MAX_TILES", 2)
+    assert contact_sheet(mixed)[1][0] == "the first 2 of 3 views"
 
 
 def test_what_is_outside_a_mask_is_dark(mixed: Variant, tmp_path: Path) -> None:
@@ -373,42 +300,6 @@ def test_what_is_outside_a_mask_is_dark(mixed: Variant, tmp_path: Path) -> None:
     assert notes == []
     assert (after[:, 130:] == before[:, 130:]).all()
     assert after[:, :126].mean() == pytest.approx(before[:, :126].mean() / 4, rel=0.02)
-
-
-@cache
-def flat_png(width: int, height: int) -> bytes:
-    """A black PNG, made without its pixels in memory: 13,000 px a side take 2 MB."""
-    row = b"\0" * (3 * width + 1)
-    compressor = zlib.compressobj(1)
-    data = b"".join([*(compressor.compress(row) for _ in range(height)), compressor.flush()])
-    head = width.to_bytes(4, "big") + height.to_bytes(4, "big") + b"\x08\x02\0\0\0"
-    chunks = ((b"IHDR", head), (b"IDAT", data), (b"IEND", b""))
-    return b"\x89PNG\r\n\x1a\n" + b"".join(
-        len(body).to_bytes(4, "big") + kind + body + zlib.crc32(kind + body).to_bytes(4, "big")
-        for kind, body in chunks
-    )
-
-
-def test_only_so_many_views_are_drawn(mixed: Variant, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("xrgs.store.contact_sheet._MAX_TILES", 2)
-    sheet, notes = contact_sheet(mixed)
-    assert notes == ["the first 2 of 3 views"]
-    two = contact_sheet(replace(mixed, views=(mixed.views[2], mixed.views[3])))[0]
-    assert np.array_equal(np.asarray(sheet)[32:], np.asarray(two)[32:])  # below the legend
-
-
-@pytest.mark.parametrize(
-    ("wrong", "field"),
-    [({"lr": 5}, "lr"), ({"rho": {"HR": ["a"]}}, "rho"), ({"attempts": [1]}, r"attempts\[0\]")],
-)
-def test_a_damaged_report_is_named_with_its_field(
-    tmp_path: Path, wrong: dict[str, Any], field: str
-) -> None:
-    folder = tmp_path / "failed-key"
-    folder.mkdir()
-    (folder / "report.json").write_text(json.dumps({"scene": "x"} | wrong))
-    with pytest.raises(XrgsError, match=rf"damaged: \S+report\.json: {field}"):
-        describe(folder)
 
 
 def test_nothing_of_a_report_reaches_the_terminal_as_an_escape(tmp_path: Path) -> None:
@@ -427,9 +318,3 @@ def test_nothing_of_a_report_reaches_the_terminal_as_an_escape(tmp_path: Path) -
     assert all(line.isprintable() for line in lines)
     assert len(lines) == 6
     assert max(map(len, lines)) <= MAX_LINE
-
-
-def test_a_scene_of_another_s_words_is_drawn_on_one_line(mixed: Variant) -> None:
-    sheet = contact_sheet(replace(mixed, scene="a\nb\x1b"))[0]
-    plain = contact_sheet(replace(mixed, scene="a b "))[0]
-    assert np.array_equal(np.asarray(sheet), np.asarray(plain))

@@ -42,14 +42,16 @@ def made_with() -> Provenance:
 
 
 def test_a_clean_checkout_has_its_commit_and_no_difference(checkout: Path) -> None:
-    (checkout / "xrgs/_native.so").write_text("built")
-    (checkout / "README.md").write_text("no source")
-    (checkout / "notes").write_text("no source")
+    for name in ("xrgs/_native.so", "README.md", "notes"):
+        (checkout / name).write_text("no source")
+    # The file of a build that was killed; a checkout itself is asked.
+    (checkout / "xrgs" / "_commit.json").write_text('{"git": "0123", "git_diff_sha256": null}')
+    (checkout / ".gitignore").write_text("*.so\n_commit.json\n")
     assert made_with().git == git(checkout, "rev-parse", "HEAD").strip()
     assert made_with().git_diff_sha256 is None
 
 
-@pytest.mark.parametrize("name", [*FILES[:3], "conf/ablation/néw one.yaml", "xrgs/new.py"])
+@pytest.mark.parametrize("name", ["sweeps/all.yaml", "conf/ablation/néw one.yaml"])
 def test_a_source_that_is_not_committed_is_a_difference(checkout: Path, name: str) -> None:
     """Also a new file: an ablation that exists at no commit."""
     found = {made_with().git_diff_sha256}
@@ -72,16 +74,6 @@ def test_a_package_inside_the_repository_of_somebody_else_has_no_commit(
     assert (made_with().git, made_with().git_diff_sha256) == (None, None)
     (package / "_commit.json").write_text('{"git": "0123", "git_diff_sha256": null}')
     assert (made_with().git, made_with().git_diff_sha256) == ("0123", None)
-
-
-def test_a_checkout_is_asked_and_not_the_file_of_a_build_that_was_killed(checkout: Path) -> None:
-    (checkout / "xrgs" / "_commit.json").write_text('{"git": "0123", "git_diff_sha256": null}')
-    assert made_with().git == git(checkout, "rev-parse", "HEAD").strip()
-
-
-def test_without_git_there_is_no_commit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(xrgs, "__file__", str(tmp_path / "xrgs/__init__.py"))
-    assert (made_with().git, made_with().git_diff_sha256) == (None, None)
 
 
 def test_backends_and_gpus_are_other_machines(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -97,28 +97,20 @@ def test_a_lens_for_each_photograph_has_the_same_images_and_masks(
     assert hashes(folder) == hashes(built.folder)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ('"motorcycle_', '"x_', "report.json: lenses: none is of view motorcycle_"),
-        ('"lenses"', '"lens"', "report.json: .*missing required field `lenses`"),
-        ('"model"', '"x"', r"report.json: lenses\[0\].lens: .*missing required field `model`"),
-    ],
-)
 def test_a_damaged_report_is_named(
-    stereo_variant: Variant,
-    made_again: Restore,
-    tmp_path: Path,
-    old: str,
-    new: str,
-    message: str,
+    stereo_variant: Variant, made_again: Restore, tmp_path: Path
 ) -> None:
-    folder = without_images(stereo_variant, tmp_path / stereo_variant.id)
-    report = folder / "report.json"
-    assert old in report.read_text()
-    report.write_text(report.read_text().replace(old, new))
-    with pytest.raises(StoreError, match=f"damaged: .*{message}"):
-        made_again(folder)
+    for number, (old, new, message) in enumerate(
+        (
+            ('"motorcycle_', '"x_', "report.json: lenses: none is of view motorcycle_"),
+            ('"model"', '"x"', r"report.json: lenses\[0\].lens: .*missing required field `model`"),
+        )
+    ):
+        folder = without_images(stereo_variant, tmp_path / str(number) / stereo_variant.id)
+        report = folder / "report.json"
+        report.write_text(report.read_text().replace(old, new))
+        with pytest.raises(StoreError, match=f"damaged: .*{message}"):
+            made_again(folder)
 
 
 def test_photographs_that_changed_and_are_missing_are_named(

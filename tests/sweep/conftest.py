@@ -5,7 +5,9 @@ from __future__ import annotations
 import io
 import os
 from collections.abc import Callable, Mapping
+from copy import deepcopy
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,7 @@ from omegaconf import DictConfig
 
 from xrgs import config
 from xrgs.config import Conf
+from xrgs.runtime import lease
 from xrgs.safeio.atomic import write_json
 from xrgs.store.attempts import begin_attempt, plan_cell
 from xrgs.store.cell_folder import CellFolder
@@ -131,17 +134,27 @@ def sick(monkeypatch: pytest.MonkeyPatch) -> Callable[[str, int], None]:
     return sicken
 
 
+@cache
+def _hydra_config(overrides: tuple[str, ...]) -> DictConfig:
+    with hydra.initialize_config_dir(str(config.CONF_DIR), version_base="1.3"):
+        return hydra.compose("config", list(overrides), return_hydra_config=True)
+
+
+def hydra_config(*overrides: str) -> DictConfig:
+    """Compose a sweep's config with Hydra's own part; equal ones once, each takes 0.1 s."""
+    return deepcopy(_hydra_config(overrides))
+
+
 class ConfigLoader:
     """Composes as Hydra's loader does, and counts."""
 
-    def __init__(self, always: list[str]) -> None:
+    def __init__(self, always: tuple[str, ...]) -> None:
         self.always = always
         self.composed: list[list[str]] = []
 
     def load_sweep_config(self, _: DictConfig, overrides: list[str]) -> DictConfig:
         self.composed.append(overrides)
-        with hydra.initialize_config_dir(str(config.CONF_DIR), version_base="1.3"):
-            return hydra.compose("config", [*self.always, *overrides], return_hydra_config=True)
+        return hydra_config(*self.always, *overrides)
 
 
 @pytest.fixture
@@ -150,10 +163,8 @@ def study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Stud
     monkeypatch.chdir(tmp_path)
 
     def made(*overrides: str) -> Study:
-        loader = ConfigLoader(list(overrides))
-        with hydra.initialize_config_dir(str(config.CONF_DIR), version_base="1.3"):
-            composed = hydra.compose("config", list(overrides), return_hydra_config=True)
-        return Study(HydraContext(loader, None), len, composed)  # type: ignore[arg-type]
+        context = HydraContext(ConfigLoader(overrides), None)  # type: ignore[arg-type]
+        return Study(context, len, hydra_config(*overrides))
 
     return made
 
@@ -162,6 +173,5 @@ def study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Stud
 def session(tmp_path: Path) -> SweepSession:
     """A call of `xrgs-sweep` that belongs to this process."""
     (tmp_path / "session").mkdir()
-    session = SweepSession(tmp_path / "session")
-    session.begin()
-    return session
+    lease.sign(tmp_path / "session" / "sweep")
+    return SweepSession(tmp_path / "session")

@@ -15,29 +15,20 @@ def labels_and_conditions(*arguments: str) -> list[tuple[str, str]]:
     return [(spec.label, spec.condition) for spec in expand(arguments)]
 
 
-def test_no_argument_gives_the_baseline() -> None:
-    assert labels_and_conditions() == [(BASELINE, "")]
-
-
-@pytest.mark.parametrize("prefix", ["+", "", "++"])
-def test_an_ablation_brings_its_baseline(prefix: str) -> None:
-    specs = labels_and_conditions(f"{prefix}ablation=consistency")
-    assert specs == [(BASELINE, ""), ("consistency", "")]
-
-
-def test_a_baseline_that_is_named_is_not_planned_twice() -> None:
-    specs = labels_and_conditions("+ablation=baseline,consistency")
-    assert specs == [(BASELINE, ""), ("consistency", "")]
-
-
-def test_ablations_stack() -> None:
-    specs = labels_and_conditions("+ablation=[loss_weighting,consistency]")
-    assert specs[1][0] == "loss_weighting+consistency"
-
-
-def test_spaces_and_quotes_are_not_part_of_a_label() -> None:
-    specs = labels_and_conditions("+ablation=[loss_weighting, 'consistency']")
-    assert specs[1][0] == "loss_weighting+consistency"
+@pytest.mark.parametrize(
+    ("argument", "labels"),
+    [
+        ("seed=0", []),
+        ("+ablation=consistency", ["consistency"]),
+        ("ablation=consistency", ["consistency"]),
+        ("+ablation=baseline,consistency", ["consistency"]),
+        ("+ablation=[loss_weighting, 'consistency']", ["loss_weighting+consistency"]),
+    ],
+)
+def test_each_ablation_has_its_label_and_brings_the_baseline(
+    argument: str, labels: list[str]
+) -> None:
+    assert labels_and_conditions(argument) == [(label, "") for label in (BASELINE, *labels)]
 
 
 def test_a_cell_has_the_overrides_of_its_combination() -> None:
@@ -81,40 +72,27 @@ def test_each_seed_and_scene_has_a_baseline_of_its_own() -> None:
         assert len(matching) == 1
 
 
-def test_a_swept_value_is_a_condition_and_a_fixed_one_is_not() -> None:
-    specs = expand(["+ablation=consistency", "train.steps=10,20", "splat.eps=1"])
-    assert {spec.condition for spec in specs} == {"train.steps=10", "train.steps=20"}
-
-
 @pytest.mark.parametrize(
-    "axis", ["scene.path=a,b", "scene.views=8,9", "seed=0,1", "variant.seed=0,1"]
+    ("axis", "is_condition"),
+    [
+        ("train.steps=10,20", True),
+        ("variant.sfm.seed=0,1", True),
+        ("+scenery.path=a,b", True),
+        ("scene.path=a,b", False),
+        ("seed=0,1", False),
+        ("variant.seed=0,1", False),
+    ],
 )
-def test_values_of_the_scene_and_the_replicate_are_no_condition(axis: str) -> None:
-    """Tables have columns of their own for the scene and the replicate."""
-    specs = expand(["+ablation=consistency", axis])
+def test_a_swept_value_but_of_the_scene_and_the_replicate_is_a_condition(
+    axis: str, is_condition: bool
+) -> None:
+    """Tables have columns of their own for these."""
+    specs = expand(["+ablation=consistency", axis, "splat.eps=1"])
     assert len(specs) == 4
-    assert {spec.condition for spec in specs} == {""}
+    key, _, values = axis.lstrip("+").partition("=")
+    conditions = {f"{key}={value}" for value in values.split(",")} if is_condition else {""}
+    assert {spec.condition for spec in specs} == conditions
     assert len({spec.shared for spec in specs}) == 2
-
-
-def test_a_draw_of_the_views_that_follows_the_seed_is_no_axis_of_its_own() -> None:
-    specs = expand(["+ablation=consistency", "seed=0,1,2", "variant.seed=${seed}"])
-    assert len(specs) == 6
-    assert {spec.condition for spec in specs} == {""}
-    assert [spec.shared[0] for spec in specs[::2]] == ["seed=0", "seed=1", "seed=2"]
-    assert len({spec.shared[1] for spec in specs}) == 1, "for Hydra to resolve in each cell"
-
-
-def test_other_seeds_and_values_of_the_variant_are_conditions() -> None:
-    for axis in ("variant.sfm.seed=0,1", "variant.factor=2,4"):
-        values = axis.partition("=")[2].split(",")
-        key = axis.partition("=")[0]
-        assert {spec.condition for spec in expand([axis])} == {f"{key}={v}" for v in values}
-
-
-def test_a_key_that_begins_like_the_scene_is_a_condition() -> None:
-    specs = expand(["+ablation=consistency", "+scenery.path=a,b"])
-    assert {spec.condition for spec in specs} == {"scenery.path=a", "scenery.path=b"}
 
 
 def test_a_component_value_belongs_to_the_change_and_not_to_the_baseline() -> None:
@@ -125,9 +103,6 @@ def test_a_component_value_belongs_to_the_change_and_not_to_the_baseline() -> No
         "consistency consistency.weight=0.2",
     ]
     assert specs[0].overrides == []
-
-
-def test_an_interval_is_refused_by_name() -> None:
     with pytest.raises(XrgsError, match=r"interval\(0,1\): an axis must be a list"):
         expand(["seed=interval(0,1)"])
 

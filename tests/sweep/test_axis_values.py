@@ -22,37 +22,18 @@ def values(written: str) -> list[str]:
     [
         ("range(5,0,-2)", "5 3 1"),
         ("sort(range(5,0,-2))", "1 3 5"),
-        ("sort(range(100,450,200),reverse=true)", "300 100"),
         ("sort(range(0,5,2),reverse=true)", "4 2 0"),
-        ("sort(sort(range(5,0,-2)),reverse=true)", "5 3 1"),
-        ("sort(sweep=range(3,0,-1))", "1 2 3"),
         ("range(0.1,0.4,0.1)", "0.1 0.2 0.3"),
         ("range(0,1,0.1)", "0.0 0.1 0.2 0.3 0.4 0.5 0.6 0.7 0.8 0.9"),
         ("sort(range(0.1,0.4,0.1),reverse=true)", "0.3 0.2 0.1"),
-        ("range(1,0,-0.25)", "1.0 0.75 0.5 0.25"),
         ("range(1e-5,4e-5,1e-5)", "1e-05 2e-05 3e-05"),
         ("range(start=1,stop=4)", "1 2 3"),
-        ("range(3)", "0 1 2"),
         ("int(range(0.5,3.5))", "0 1 2"),
-        ("float(range(3))", "0.0 1.0 2.0"),
-        ("tag(a,range(0,2))", "0 1"),
-        ("sort(shuffle(range(5)))", "0 1 2 3 4"),
-        ("sort(3,1,2)", "1 2 3"),
         ("sort(choice(3,1,2),reverse=true)", "3 2 1"),
-        ("sort([3,1,2])", "[1,2,3]"),
     ],
 )
 def test_an_axis_has_the_values_that_are_written(written: str, expected: str) -> None:
     assert values(written) == expected.split()
-
-
-@pytest.mark.parametrize(
-    "written", ["shuffle(range(40))", "shuffle(sweep=range(40))", "int(shuffle(range(40)))"]
-)
-def test_a_shuffled_axis_has_every_value_once(written: str) -> None:
-    found = values(written)
-    assert sorted(map(int, found)) == [*range(40)]
-    assert found != sorted(found, key=int)  # equal in one of 40! cases
 
 
 @given(start=st.integers(-99, 99), count=st.integers(1, 30), step=st.integers(1, 99))
@@ -66,15 +47,13 @@ def test_a_range_of_decimals_is_that_of_whole_numbers_divided(
     assert values(f"sort(range({stop - step},{start - 1},{-step}))") == [*map(str, whole)]
 
 
-@pytest.mark.parametrize("written", ["range(3,3)", "range(5,0)", "range(1,3),7", "[range(1,3)]"])
+@pytest.mark.parametrize("written", ["range(3,3)", "range(1,3),7", "[range(1,3)]"])
 def test_an_axis_without_values_and_a_function_in_a_list_are_refused(written: str) -> None:
     with pytest.raises(XrgsError, match=r"this axis has no value|an axis is one list"):
         values(written)
 
 
-@pytest.mark.parametrize(
-    "written", ["range(1,5,0)", "range(0,nan)", "range(0,inf)", "choice(range(3))", "sort(a,1)"]
-)
+@pytest.mark.parametrize("written", ["range(1,5,0)", "range(0,nan)", "range(0,99999999)"])
 def test_a_function_of_wrong_arguments_is_refused(written: str) -> None:
     with pytest.raises(HydraException, match="while evaluating"):
         values(written)

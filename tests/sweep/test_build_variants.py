@@ -9,11 +9,11 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 from PIL import Image
 
@@ -48,8 +48,16 @@ def conf(compose: Callable[..., Conf]) -> Conf:
     return compose("scene=motorcycle")
 
 
-def names(folder: Path) -> list[str]:
-    return sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
+@pytest.fixture
+def of_folder(compose: Callable[..., Conf], tmp_path: Path) -> Callable[..., Conf]:
+    """(path of the scene, **changes of the variant) -> a config of a folder of photographs."""
+
+    def made(path: Path, **changes: Any) -> Conf:
+        conf = compose("scene=folder", f"scene.path={tmp_path.root}")
+        variant_conf = replace(conf.variant, **changes)
+        return replace(conf, scene=replace(conf.scene, path=str(path)), variant=variant_conf)
+
+    return made
 
 
 def plan(conf: Conf, store: Store, *, allow_build: bool) -> PlannedVariant:
@@ -92,19 +100,13 @@ def test_a_frozen_variant_is_found_and_not_built(
     assert plan(conf, store, allow_build=True) == reported
 
 
-def test_a_trimmed_variant_has_its_notes(
+def test_a_trimmed_variant_has_its_notes_and_a_report_that_is_damaged_is_named(
     conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch, reported: PlannedVariant
 ) -> None:
     monkeypatch.setattr(variant, "key", lambda *_: "k")
-    (store.variants / "k-1").rename(store.variants / "trimmed-k-1")
+    trimmed = (store.variants / "k-1").rename(store.variants / "trimmed-k-1")
     assert plan(conf, store, allow_build=False) == reported
-
-
-def test_a_report_that_is_damaged_is_named(
-    conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch, reported: PlannedVariant
-) -> None:
-    monkeypatch.setattr(variant, "find", lambda *_: SimpleNamespace(id="k-1"))
-    (store.variants / "k-1" / "report.json").write_text('{"notes": 3}')
+    (trimmed / "report.json").write_text('{"notes": 3}')
     (note,) = plan(conf, store, allow_build=True).notes
     assert "k-1/report.json" in note
 
@@ -129,6 +131,10 @@ def test_a_variant_that_the_store_lacks_is_built_in_a_child(
 def test_a_scene_that_failed_is_not_tried_again_unless_asked(
     conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(job, "run_in_child", fail)
+    assert plan(conf, store, allow_build=True) == PlannedVariant(error="SfM placed too few views")
+    with pytest.raises(XrgsError, match="SfM placed too few views"):
+        build_variants.find_or_build(conf, store)
     remember_failure(conf, store)
     monkeypatch.setattr(job, "run_in_child", unexpected)
     failed_before = PlannedVariant(error="no first pair", remembered=True)
@@ -140,68 +146,61 @@ def test_a_scene_that_failed_is_not_tried_again_unless_asked(
     assert plan(conf, store, allow_build=True) == failed_before
 
 
-def test_a_failure_is_the_reason_in_the_plan_and_an_error_elsewhere(
-    conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("said", [True, False])
+def test_a_full_disk_is_not_a_failure_of_the_scene_and_ends_the_other_builds(
+    conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch, said: bool
 ) -> None:
-    monkeypatch.setattr(job, "run_in_child", fail)
-    assert plan(conf, store, allow_build=True) == PlannedVariant(error="SfM placed too few views")
-    with pytest.raises(XrgsError, match="SfM placed too few views"):
-        build_variants.find_or_build(conf, store)
+    """COLMAP dies of it without saying so."""
+    both, ended = threading.Barrier(2, timeout=30), []
 
-
-def test_a_library_that_dies_of_a_full_disk_is_not_a_failure_of_the_scene(
-    conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
     def full(**_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    def dies(*_: object) -> dict[str, Any]:
-        monkeypatch.setattr(tempfile, "TemporaryFile", full)
-        raise job.WorkError("its process was ended by SIGABRT")
+    def build(
+        _: str, request: dict[str, Any], __: object, on_poll: Callable[[int], None], ___: object
+    ) -> dict[str, Any]:
+        both.wait()
+        if request["conf"]["variant"]["factor"] == 2:
+            if said:
+                raise job.WorkError("No space left on device", job.UNWRITABLE)
+            monkeypatch.setattr(tempfile, "TemporaryFile", full)
+            raise job.WorkError("its process was ended by SIGABRT")
+        end = time.monotonic() + 30
+        try:
+            while time.monotonic() < end:
+                on_poll(0)
+        except job.WorkError:
+            ended.append(3)
+            raise
+        return {"variant": "k-3"}
 
-    monkeypatch.setattr(job, "run_in_child", dies)
+    monkeypatch.setattr(build_variants, "usable_cores", lambda: 2)
+    monkeypatch.setattr(job, "run_in_child", build)
     with pytest.raises(StoreError, match="No space left"):
-        plan(conf, store, allow_build=True)
+        build_variants.plan(two(conf), store, allow_build=True)
+    assert ended == [3]
 
 
-def test_a_child_that_can_not_write_stops_the_sweep(
-    conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def unwritable(*_: object) -> dict[str, Any]:
-        raise job.WorkError("No space left on device", job.UNWRITABLE)
-
-    monkeypatch.setattr(job, "run_in_child", unwritable)
-    with pytest.raises(StoreError, match=r"No space left.*Finished cells are kept"):
-        plan(conf, store, allow_build=True)
-
-
-@pytest.mark.parametrize("number", [errno.EACCES, errno.EIO, errno.ESTALE])
 def test_a_variant_that_can_not_be_read_now_is_not_built_anew(
     conf: Conf,
     store: Store,
     monkeypatch: pytest.MonkeyPatch,
     sick: Callable[[str, int], None],
-    number: int,
 ) -> None:
     frozen = store.variants / f"{variant.key(conf.scene, conf.variant)}-0123456789abcdef"
     frozen.mkdir()
     (frozen / "variant.json").write_text("{}")
     monkeypatch.setattr(job, "run_in_child", unexpected)
-    sick("variant.json", number)
+    sick("variant.json", errno.ESTALE)
     found = plan(conf, store, allow_build=True)
     assert found == PlannedVariant(error=found.error)
-    assert f"{frozen}/variant.json: {os.strerror(number)}" in str(found.error)
+    assert f"{frozen}/variant.json: {os.strerror(errno.ESTALE)}" in str(found.error)
     assert [path.name for path in frozen.iterdir()] == ["variant.json"]
 
-
-def test_a_folder_of_variants_that_can_not_be_listed_is_named(
-    conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
     def fail(path: Path) -> list[str]:
         raise OSError(errno.EACCES, os.strerror(errno.EACCES), str(path))
 
-    monkeypatch.setattr(Path, "iterdir", fail)
-    monkeypatch.setattr(job, "run_in_child", unexpected)
+    monkeypatch.setattr(Path, "iterdir", fail)  # the folder of variants can't be listed
     assert "Permission denied" in str(plan(conf, store, allow_build=True).error)
 
 
@@ -224,91 +223,47 @@ def test_a_store_that_vanishes_while_a_variant_is_built_does_not_reappear(
     assert not store.path.exists()
 
 
-def two(compose: Callable[..., Conf]) -> list[Conf]:
+def two(conf: Conf) -> list[Conf]:
     """Configs of two variants of a scene."""
-    return [compose("scene=motorcycle", f"variant.factor={factor}") for factor in (2, 3)]
+    return [replace(conf, variant=replace(conf.variant, factor=factor)) for factor in (2, 3)]
 
 
+@pytest.mark.parametrize(
+    ("cores", "memory", "at_once"), [(5, 1 << 40, 2), (1, 1 << 40, 1), (8, 1, 1)]
+)
 def test_variants_are_built_at_once_on_shares_of_the_cores(
-    compose: Callable[..., Conf],
+    conf: Conf,
     store: Store,
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
+    cores: int,
+    memory: int,
+    at_once: int,
 ) -> None:
-    both = threading.Barrier(2, timeout=30)
+    together = threading.Barrier(at_once, timeout=30)
     environments = []
 
     def build(_: str, request: dict[str, Any], *rest: Any) -> dict[str, Any]:
         environments.append(rest[-1])
-        both.wait()  # a second build that began after the end of the first would break it
+        together.wait()  # a second build that began after the end of the first would break it
         return {"variant": f"k-{request['conf']['variant']['factor']}"}
 
-    monkeypatch.setattr(build_variants, "usable_cores", lambda: 5)
+    monkeypatch.setattr(build_variants, "usable_cores", lambda: cores)
+    monkeypatch.setattr(build_variants, "usable_memory", lambda: memory)
     monkeypatch.setattr(job, "run_in_child", build)
-    planned = build_variants.plan(two(compose), store, allow_build=True)
+    planned = build_variants.plan(two(conf), store, allow_build=True)
     assert [found.id for found in planned] == ["k-2", "k-3"]
-    assert environments == [{"PYTHON_CPU_COUNT": "2", "TQDM_DISABLE": "1"}] * 2
+    several = {"TQDM_DISABLE": "1"} if at_once > 1 else {}
+    assert environments == [{"PYTHON_CPU_COUNT": str(cores // at_once)} | several] * 2
     lines = sorted(capfd.readouterr().err.splitlines())
     assert lines == [f"motorcycle: {BUILDING} {place} of 2" for place in (1, 2)]
-
-
-@pytest.mark.parametrize("lacking", ["cores", "memory"])
-def test_as_many_are_built_at_once_as_there_is_room_for(
-    compose: Callable[..., Conf], store: Store, monkeypatch: pytest.MonkeyPatch, lacking: str
-) -> None:
-    building = threading.Lock()
-
-    def build(*arguments: Any) -> dict[str, Any]:
-        assert "TQDM_DISABLE" not in arguments[-1]
-        assert building.acquire(blocking=False)
-        time.sleep(0.05)
-        building.release()
-        return {"variant": "k-1"}
-
-    monkeypatch.setattr(build_variants, "usable_cores", lambda: 1 if lacking == "cores" else 8)
-    monkeypatch.setattr(
-        build_variants, "usable_memory", lambda: 1 if lacking == "memory" else 1 << 40
-    )
-    monkeypatch.setattr(job, "run_in_child", build)
-    planned = build_variants.plan(two(compose), store, allow_build=True)
-    assert [found.id for found in planned] == ["k-1", "k-1"]
-
-
-def test_a_build_that_stops_the_sweep_ends_the_others(
-    compose: Callable[..., Conf], store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    both, ended = threading.Barrier(2, timeout=30), []
-
-    def build(
-        _: str, request: dict[str, Any], __: object, on_poll: Callable[[int], None], ___: object
-    ) -> dict[str, Any]:
-        both.wait()
-        if request["conf"]["variant"]["factor"] == 2:
-            raise job.WorkError("No space left on device", job.UNWRITABLE)
-        end = time.monotonic() + 30
-        try:
-            while time.monotonic() < end:
-                on_poll(0)
-        except job.WorkError:
-            ended.append(3)
-            raise
-        return {"variant": "k-3"}
-
-    monkeypatch.setattr(build_variants, "usable_cores", lambda: 2)
-    monkeypatch.setattr(job, "run_in_child", build)
-    with pytest.raises(StoreError, match="No space left"):
-        build_variants.plan(two(compose), store, allow_build=True)
-    assert ended == [3]
 
 
 @pytest.mark.slow
 def test_sweeps_of_a_scene_that_sfm_can_not_place(
     forked_command: Callable[..., tuple[int, str, str]], tmp_path: Path
 ) -> None:
-    for number in range(3):  # SIFT finds no feature in a flat image
-        pixels = np.full((30, 40, 3), 40 + number, np.uint8)
-        (tmp_path / "leaves").mkdir(exist_ok=True)
-        Image.fromarray(pixels).save(tmp_path / "leaves" / f"{number}.png")
+    photographs(tmp_path / "leaves", 3, (40, 30))  # SIFT finds no feature in a flat image
     scene = ("scene=folder", "scene.path=leaves", "preset=smoke", "store=s", *CONF)
     code, table, err = forked_command("sweep", tmp_path, *scene)
     assert code == 1
@@ -326,33 +281,15 @@ def test_sweeps_of_a_scene_that_sfm_can_not_place(
     assert "failed scenes, not tried again; retry=failed tries them again" in text
     assert "  leaves  scene leaves failed: 0 of 3 photographs are placed" in text
     assert "\n".join(TO_TRY) in text
-    retry = ("retry=failed", "fail_fast=true")
-    code, table, err = forked_command("sweep", tmp_path, *scene, *retry)
-    assert code == 1
-    assert BUILDING in err
-    assert HINT not in err
-
-
-def test_a_folder_that_is_missing_is_looked_for_again_without_retry(
-    sweeps_in: Callable[..., Any], tmp_path: Path
-) -> None:
-    code, _, err = sweeps_in(tmp_path).run("scene=folder", "scene.path=nowhere", "dry_run=true")
-    assert code == 1
-    assert "no such folder" in err
-    assert HINT not in err
 
 
 @pytest.mark.parametrize("readable", [1, 4])
 def test_a_dry_run_reads_the_headers_of_photographs(
-    compose: Callable[..., Conf],
-    store: Store,
-    tmp_path: Path,
-    readable: int,
+    of_folder: Callable[..., Conf], store: Store, tmp_path: Path, readable: int
 ) -> None:
     scene = photographs(tmp_path / "scene", readable)
     (scene / "x.jpg").write_bytes(b"xx")
-    conf = compose("scene=folder", f"scene.path={scene}")
-    planned = plan(conf, store, allow_build=False)
+    planned = plan(of_folder(scene), store, allow_build=False)
     if readable == 4:
         note, becomes = planned.notes
         assert note.startswith("left out: x.jpg (unreadable or truncated image")
@@ -378,33 +315,27 @@ def photographs(folder: Path, count: int, size: tuple[int, int] = (120, 80)) -> 
     ("count", "size", "changes", "error"),
     [
         (
-            2,
-            (120, 80),
-            (),
+            *(2, (120, 80), {}),
             "scene scene: 2 photographs are too few: 1 is held out to test on, and 1 left to train"
             " on, which takes two. Add photographs, or hold none out: variant.test_every=0",
         ),
-        (5, (40, 30), (), "0 photograph(s) can be used.*lower variant.factor to 2"),
+        (5, (40, 30), {}, "0 photograph(s) can be used.*lower variant.factor to 2"),
         (
-            5,
-            (120, 80),
-            ("variant.test=[1,2,3,4]",),
+            *(5, (120, 80), {"test": [1, 2, 3, 4]}),
             "5 photographs are too few: 4 are held out.* or name fewer or others in variant.test",
         ),
-        (5, (120, 80), ("variant.tags=megapixels",), "every training view is HR"),
     ],
 )
 def test_a_plan_says_what_no_variant_can_be_made_of(
-    compose: Callable[..., Conf],
+    of_folder: Callable[..., Conf],
     store: Store,
     tmp_path: Path,
     count: int,
     size: tuple[int, int],
-    changes: tuple[str, ...],
+    changes: dict[str, Any],
     error: str,
 ) -> None:
-    scene = photographs(tmp_path / "scene", count, size)
-    conf = compose("scene=folder", f"scene.path={scene}", *changes)
+    conf = of_folder(photographs(tmp_path / "scene", count, size), **changes)
     planned = plan(conf, store, allow_build=False)
     assert re.search(re.sub(r"[()]", r"\\\g<0>", error), planned.error or "")
     with pytest.raises(XrgsError):  # the build says the same, or asks more of SfM
@@ -412,9 +343,9 @@ def test_a_plan_says_what_no_variant_can_be_made_of(
 
 
 def test_photographs_of_which_too_few_are_trained_on_are_refused_before_sfm(
-    compose: Callable[..., Conf], store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    of_folder: Callable[..., Conf], store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    conf = compose("scene=folder", f"scene.path={photographs(tmp_path / 'scene', 2)}")
+    conf = of_folder(photographs(tmp_path / "scene", 2))
     monkeypatch.setattr(job, "run_in_child", unexpected)
     planned = plan(conf, store, allow_build=True)
     assert "1 is held out to test on" in str(planned.error)
@@ -423,23 +354,18 @@ def test_photographs_of_which_too_few_are_trained_on_are_refused_before_sfm(
     monkeypatch.setattr(job, "run_in_child", fail)  # with every photograph, SfM is tried
     conf.variant.test_every = 0
     assert plan(conf, store, allow_build=True).error == "SfM placed too few views"
-
-
-def test_a_plan_says_that_no_view_is_lr(
-    compose: Callable[..., Conf], store: Store, tmp_path: Path
-) -> None:
-    conf = compose("scene=folder", f"scene.path={photographs(tmp_path / 'scene', 3)}")
-    becomes = "3 photographs: 1 held out, 2 to train on, as they are"
-    assert plan(conf, store, allow_build=False).notes == (
-        becomes,
-        "no LR view: 2 training photographs are all HR by variant.min_hr=2; nothing is mixed",
-    )
+    becomes = "2 photographs: 0 held out, 2 to train on, as they are"
+    note = "no LR view: 2 training photographs are all HR by variant.min_hr=2; nothing is mixed"
+    assert plan(conf, store, allow_build=False).notes == (becomes, note)
     conf.variant.hr_fraction = 1.0  # asked for
     assert plan(conf, store, allow_build=False).notes == (becomes,)
+    missing = plan(of_folder(tmp_path / "nowhere"), store, allow_build=False)
+    assert "no such folder" in str(missing.error)
+    assert not missing.remembered  # it is looked for again without retry=failed
 
 
 def test_a_variant_that_is_found_says_what_the_folder_has_got_since(
-    compose: Callable[..., Conf],
+    of_folder: Callable[..., Conf],
     store: Store,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -450,8 +376,7 @@ def test_a_variant_that_is_found_says_what_the_folder_has_got_since(
     for name in ("cells", "variants"):  # as the store of a sweep in this folder
         (scene / "store" / name).mkdir()
     monkeypatch.setattr(variant, "find", lambda *_: SimpleNamespace(id="k-1"))
-    conf = compose("scene=folder", f"scene.path={scene}/**")
-    notes = plan(conf, store, allow_build=True).notes
+    notes = plan(of_folder(scene / "**"), store, allow_build=True).notes
     assert notes == ("images left out: 1 in store (a store of xrgs)", *reported.notes)
 
 
@@ -465,6 +390,6 @@ def test_images_are_made_again_of_trimmed_variants_alone(
     (store.variants / "trimmed-k-1").mkdir()
     job.restore_images(conf, store, "k-1")
     ((work, request),) = requests
-    assert work == "restore"
+    assert work == "variant"
     assert (request["variant"], request["store"]) == ("k-1", str(store.path))
     assert request["conf"]["scene"]["kind"] == "motorcycle"

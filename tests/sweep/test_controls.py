@@ -70,17 +70,10 @@ def test_each_replicate_and_condition_is_matched_to_its_own_count(
     }
 
 
-def test_a_cell_can_be_matched_to_the_baseline(study: Callable[..., Study]) -> None:
-    plan = study()._plan(["+ablation=[densify,count_matched]", "matched_to=baseline"])
-    assert [cell.spec.label for cell in plan] == [BASELINE, "densify+count_matched to baseline"]
-    assert plan[1].reference == plan[0].spec
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["+ablation=plus", "matched_to=plus"], "matched_to=plus: no ablation of this sweep"),
-        (["matched_to=plus"], "matched_to=plus: no ablation of this sweep"),
         (
             ["+ablation=count_matched", "matched_to=count_matched"],
             "matched_to=count_matched: that cell is matched to xrgs itself",
@@ -99,24 +92,15 @@ def test_a_count_to_match_without_meaning_is_refused(
         made._plan(arguments)
 
 
-@pytest.mark.parametrize("arguments", [["+ablation=plus"], []])
-def test_null_asks_for_no_control(study: Callable[..., Study], arguments: list[str]) -> None:
+def test_null_asks_for_no_control(study: Callable[..., Study]) -> None:
     made = study()
-    assert made._plan([*arguments, "matched_to=null"]) == made._plan(arguments)
+    assert made._plan(["+ablation=plus", "matched_to=null"]) == made._plan(["+ablation=plus"])
 
 
 def test_a_count_to_match_of_every_cell_of_a_file_is_refused(study: Callable[..., Study]) -> None:
     made = study("matched_to=plus")
     with pytest.raises(XrgsError, match=r"^matched_to=plus: the baseline can't be matched"):
         made._plan(["+ablation=plus"])
-
-
-def test_a_strategy_without_the_prune_rule_is_no_control_with_another_one(
-    study: Callable[..., Study],
-) -> None:
-    plan = study()._plan(["+ablation=[mcmc,count_matched]", "matched_to=keep_large"])
-    assert "mcmc+count_matched to keep_large" in {cell.spec.label for cell in plan}
-    assert mixed_prune_rules(plan) == []
 
 
 def test_a_control_with_another_prune_rule_is_named_once(study: Callable[..., Study]) -> None:

@@ -132,20 +132,12 @@ def test_pixels_scale_time_memory_and_disk(past: Past) -> None:
     assert past.cost(variant=None) == past.cost(variant="unreadable") == alike
 
 
-def test_the_median_of_equally_near_cells_counts(past: Past) -> None:
-    for seconds in (10.0, 12.0, 90.0):
-        past.add(seconds)
-    assert past.cost().seconds == pytest.approx(12)
-
-
 def test_loading_and_scoring_come_on_top(past: Past) -> None:
     past.add(40.0, overhead=5.0)
     assert past.cost() == replace(past.cost(), seconds=45.0, scoring_s=5.0)
-
-
-def test_the_dates_of_a_store_that_was_copied_tell_nothing(past: Past) -> None:
-    past.add(40.0, overhead=1e8)
-    assert past.cost().seconds == pytest.approx(40)
+    for seconds in (50.0, 99.0):
+        past.add(seconds, overhead=1e8)  # the dates of a store that was copied
+    assert past.cost().seconds == pytest.approx(50)  # the median of equally near cells
 
 
 def test_cells_of_this_processor_are_nearer(past: Past) -> None:
@@ -155,11 +147,10 @@ def test_cells_of_this_processor_are_nearer(past: Past) -> None:
     assert past.cost().seconds == pytest.approx(10)
 
 
-@pytest.mark.parametrize("spoilt", ["config.json", "summary.json", "provenance.json"])
-def test_damaged_cells_are_left_out(past: Past, spoilt: str) -> None:
+def test_damaged_cells_are_left_out(past: Past) -> None:
     past.add(40.0)
     past.add(40.0)
-    (past.store.cell("cell1").path / spoilt).write_text('{"training_time_s": "soon"}')
+    (past.store.cell("cell1").path / "summary.json").write_text('{"training_time_s": "soon"}')
     assert CostEstimator(past.store).known == 1
     assert past.cost().seconds == pytest.approx(40)
 
@@ -169,7 +160,6 @@ def test_damaged_cells_are_left_out(past: Past, spoilt: str) -> None:
     [
         ([], (HR + LR) / 2),
         (["train.hr_share=0.8"], 0.8 * HR + 0.2 * LR),
-        (["train.views=hr_only"], HR),
         (["train.views=lr_only", "train.hr_share=0.8"], LR),
         (["train.views=all_hr"], HR),
         (["+ablation=supersampled"], (HR + 4 * LR) / 2),  # LR views at twice their size

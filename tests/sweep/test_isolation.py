@@ -7,6 +7,7 @@ cell's child it replaces `xrgs.store.cell`, and injects a fault into the cells o
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -18,6 +19,8 @@ from typing import Any
 
 import pytest
 
+from xrgs.store.store import Store
+
 pytestmark = pytest.mark.slow
 
 #: (folder, faults) -> `tests.conftest.Sweeps`.
@@ -25,56 +28,60 @@ SweepsIn = Callable[..., Any]
 Ended = tuple[int, str, str]
 
 SMOKE = ("scene=motorcycle", "preset=smoke", "train.steps=4")
+#: A healthy cell writes results and ends; with a file `healed`, all are healthy.
 FAULTS = """
 import sys
 if "xrgs.sweep.job" in sys.orig_argv and "cell" in sys.orig_argv:
-    import ctypes, errno, importlib, os, signal, subprocess, time, types
+    import ctypes, errno, os, signal, subprocess, time, types
     from pathlib import Path
 
-    def real():
-        sys.modules.pop("xrgs.store.cell", None)
-        return importlib.import_module("xrgs.store.cell")
+    def trains(folder):
+        from xrgs.safeio.atomic import write_json
+        summary = {"training_time_s": 1.5, "render_time_ms": 2, "gaussians": 7, "steps": 4}
+        write_json(folder.path / "summary.json", summary | {"memory_bytes": 1, "evaluations": 1})
+        (folder.path / "scores.csv").write_text("view,psnr\\na,20\\n")
+        (folder.path / "splats.ply").write_bytes(bytes(200_000))
+        folder.finish(["a"], {})
 
-    def raises(*arguments):
-        cell = real()
-        def load(*_, **__):
-            raise RuntimeError("this cell raises")
-        cell.dataset.load = load
-        cell.run_cell(*arguments)
+    def raises(_):
+        raise RuntimeError("this cell raises")
 
-    def hangs(*_):
+    def hangs(_):
         child = subprocess.Popen([sys.executable, "-S", "-c", "import time; time.sleep(600)"])
         Path(os.environ["SWEEPS_OF"], "hangs").touch()
         time.sleep(600)
 
-    def eats(*_):
+    def eats(_):
         eaten = []
         while True:
             eaten.append(b"x" * 20_000_000)
             time.sleep(0.01)
 
-    def finds_the_disk_full(*arguments):
+    def finds_the_disk_full(folder):
         def fsync(_):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         os.fsync = fsync
-        real().run_cell(*arguments)
+        trains(folder)
 
     def run_cell(conf, variant, folder, stop):
-        fault = {
+        faults = {
             1: raises,
-            2: lambda *_: os.kill(os.getpid(), signal.SIGKILL),
-            3: lambda *_: ctypes.string_at(0),
+            2: lambda _: os.kill(os.getpid(), signal.SIGKILL),
+            3: lambda _: ctypes.string_at(0),
             4: hangs,
             5: eats,
             6: finds_the_disk_full,
-        }.get(conf.seed)
-        if fault is None:
-            real().run_cell(conf, variant, folder, stop)
-        else:
-            fault(conf, variant, folder)
+        }
+        if Path(os.environ["SWEEPS_OF"], "healed").exists():
+            faults = {}
+        faults.get(conf.seed, trains)(folder)
 
     sys.modules["xrgs.store.cell"] = types.ModuleType("xrgs.store.cell")
     sys.modules["xrgs.store.cell"].run_cell = run_cell
+else:  # no report is made, which takes as long as all else
+    import types
+    sys.modules["xrgs.report"] = types.ModuleType("xrgs.report")
+    sys.modules["xrgs.report"].build = lambda *_: types.SimpleNamespace(text="")
 """
 
 
@@ -95,7 +102,7 @@ def built(
     """A store with a sweep of a cell of most faults and a healthy one; how that ended."""
     sweeps = sweeps_in(tmp_path_factory.mktemp("faults"), FAULTS)
     shutil.copytree(smoke_variants, sweeps.folder / "s" / "variants")
-    return sweeps, sweeps.run(*SMOKE, "seed=1,2,3,5,0", "limits.memory_gb=1.2")
+    return sweeps, sweeps.run(*SMOKE, "seed=1,2,3,5,0", "limits.memory_gb=0.6")
 
 
 @pytest.fixture
@@ -111,7 +118,7 @@ def stopped(
 ) -> tuple[Any, dict[str, Ended]]:
     """On another copy, sweeps that did not come to their end, and what they said of it.
 
-    One found the disk full; others had a signal while a cell hung, which `seen` was looked at.
+    One found the disk full; others had a signal while a cell hung.
     """
     sweeps = sweeps_in(tmp_path_factory.mktemp("stopped"), FAULTS)
     shutil.copytree(built[0].folder / "s", sweeps.folder / "s")
@@ -119,9 +126,6 @@ def stopped(
     for number in (signal.SIGINT, signal.SIGKILL):
         sweep = sweeps.start(*SMOKE, "seed=4")
         wait_for(sweeps.folder / "hangs", sweep.process)
-        if number == signal.SIGKILL:
-            told["seen"] = sweeps.start(*SMOKE, "seed=4", "dry_run=true").end()
-            assert f"by process {sweep.process.pid} on" in told["seen"][2]
         sweep.process.send_signal(number)
         told[number.name] = sweep.end()
         sweeps.leave_nothing_running()
@@ -138,7 +142,7 @@ def wait_for(file: Path, process: subprocess.Popen[bytes]) -> None:
 
 
 def test_each_fault_is_its_cell_s_status_and_the_others_finish(built: tuple[Any, Ended]) -> None:
-    sweeps, (code, out, err) = built
+    sweeps, (code, _, err) = built
     assert code == 1, err
     found = sweeps.cells()
     assert status(found[0])["state"] == "done"
@@ -146,7 +150,7 @@ def test_each_fault_is_its_cell_s_status_and_the_others_finish(built: tuple[Any,
         1: "RuntimeError: this cell raises",
         2: "its process was ended by SIGKILL",
         3: "its process was ended by SIGSEGV",
-        5: "limits.memory_gb=1.2",
+        5: "limits.memory_gb=0.6",
     }
     for seed, reason in reasons.items():
         assert status(found[seed])["state"] == "failed"
@@ -154,10 +158,8 @@ def test_each_fault_is_its_cell_s_status_and_the_others_finish(built: tuple[Any,
         assert reason in (found[seed] / "error.txt").read_text()
         assert (found[seed] / "log.txt").is_file()
         assert reason in err
-        assert reason.partition(":")[0] in out  # the table says why too
-    assert "Traceback" in (found[1] / "error.txt").read_text()
+    assert "Traceback" in (found[1] / "log.txt").read_text()
     assert "Segmentation fault" in (found[3] / "log.txt").read_text()
-    assert out.count("failed") >= 4
     assert not list((sweeps.folder / "s" / "locks").iterdir())
 
 
@@ -165,7 +167,7 @@ def test_a_cell_that_hangs_is_ended_at_its_limit_and_fail_fast_starts_nothing_mo
     sweeps: Any,
 ) -> None:
     before = files(sweeps.cells()[2])
-    code, out, err = sweeps.run(*SMOKE, "seed=2,4,7", "limits.minutes=0.05", "fail_fast=true")
+    code, _, err = sweeps.run(*SMOKE, "seed=2,4,7", "limits.minutes=0.05", "fail_fast=true")
     assert code == 1
     assert (sweeps.folder / "hangs").exists()
     assert "limits.minutes=0.05" in status(sweeps.cells()[4])["reason"]
@@ -175,7 +177,7 @@ def test_a_cell_that_hangs_is_ended_at_its_limit_and_fail_fast_starts_nothing_mo
     # What had failed is left as it was, for nobody has asked for another try.
     assert files(sweeps.cells()[2]) == before
     assert "retry=failed" in err
-    assert "SIGKILL" in out
+    assert "SIGKILL" in err
 
 
 def test_a_full_disk_stops_the_sweep_and_costs_no_cell(
@@ -206,13 +208,13 @@ def test_a_killed_sweep_is_taken_over_and_two_at_once_train_each_cell_once(
     """What was stopped and what a full disk had no room for, in one go."""
     sweeps, told = stopped
     assert told["SIGKILL"][0] == -signal.SIGKILL
-    assert "running" in told["seen"][2]
     assert [file.name for file in (sweeps.folder / "s" / "locks").iterdir()] == [
         f"{sweeps.cells()[4].name}.0"
     ]
     before = files(sweeps.cells()[0])
     arguments = (*SMOKE, "seed=4,6,0")
-    both = [sweeps.start(*arguments, faults=False) for _ in range(2)]
+    (sweeps.folder / "healed").touch()
+    both = [sweeps.start(*arguments) for _ in range(2)]
     printed = [sweep.end() for sweep in both]
     sweeps.leave_nothing_running()
     assert [code for code, *_ in printed] == [0, 0], printed
@@ -226,8 +228,8 @@ def test_a_killed_sweep_is_taken_over_and_two_at_once_train_each_cell_once(
     assert not list((sweeps.folder / "s" / "locks").iterdir())
 
 
-#: In a mount namespace of its own: the store moves to a small disk, which has hardly any room, then
-#: can't be written, and then has room.
+#: In a mount namespace of its own: the store moves to a small disk, which has hardly any room, and
+#: then can't be written.
 _SMALL_DISK = """
 import os, shutil, subprocess, sys
 
@@ -249,10 +251,7 @@ with open("s/filler", "wb") as filler:
 call("tight", *sys.argv[1:], "seed=8,9,0")
 mount("remount,ro")
 call("read-only", *sys.argv[1:], "seed=8,9,0")
-mount("remount,rw")
-os.unlink("s/filler")
-call("room", *sys.argv[1:], "seed=8,9,0", "dry_run=true")
-shutil.copytree("s", "after")
+shutil.copytree("s", "after", ignore=shutil.ignore_patterns("filler"))
 """
 
 
@@ -261,9 +260,11 @@ def test_a_disk_that_takes_no_more_is_said_and_loses_nothing(sweeps: Any) -> Non
     probe = [*own, "mount", "-t", "tmpfs", "tmpfs", str(sweeps.folder)]
     if shutil.which("unshare") is None or subprocess.run(probe, check=False).returncode:
         pytest.skip("this system lets nobody mount a small disk")
+    (sweeps.folder / "sitecustomize.py").write_text(FAULTS)
     done = subprocess.run(
         [*own, sys.executable, "-c", _SMALL_DISK, *SMOKE, "threads=1", "store=s"],
         cwd=sweeps.folder,
+        env=os.environ | {"PYTHONPATH": str(sweeps.folder), "SWEEPS_OF": str(sweeps.folder)},
         capture_output=True,
         text=True,
         check=True,
@@ -279,10 +280,8 @@ def test_a_disk_that_takes_no_more_is_said_and_loses_nothing(sweeps: Any) -> Non
         assert "store=s" in err
         assert "Traceback" not in err
         assert "Finished cells are kept" in err or "choose another with store=" in err
-    code, plan = told["room"]
-    assert code == "0"
-    assert "3 cells, 1 done" in plan
-    assert "failed " not in plan
-    healthy = sweeps.folder / "before" / "cells"
-    for cell in healthy.iterdir():
-        assert files(sweeps.folder / "after" / "cells" / cell.name).keys() == files(cell).keys()
+    before, after = (Store(sweeps.folder / name).cell_folders() for name in ("before", "after"))
+    states = {cell.id: cell.state().name for cell in after}
+    for cell in before:
+        assert states.pop(cell.id) == cell.state().name
+    assert set(states.values()) <= {"planned", "unfinished"}  # those are trained again

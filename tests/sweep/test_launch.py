@@ -6,16 +6,17 @@ import pickle
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-import hydra
 import pytest
 from hydra.core.plugins import Plugins
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.types import HydraContext
 from omegaconf import DictConfig, OmegaConf
 
+from tests.sweep.conftest import hydra_config
 from xrgs import config
 from xrgs.cli.overrides import with_quotes
 from xrgs.errors import XrgsError
@@ -26,7 +27,7 @@ from xrgs.store.store import Store
 from xrgs.sweep import study
 from xrgs.sweep.axes import CellSpec
 from xrgs.sweep.job import INTERRUPTED
-from xrgs.sweep.launchers import capacity, one_cell_a_gpu
+from xrgs.sweep.launchers import capacity, check, one_cell_a_gpu
 from xrgs.sweep.plan import PlannedCell
 from xrgs.sweep.session import SweepSession
 from xrgs.sweep.study import LOST, Launches
@@ -37,18 +38,14 @@ from xrgs.sweep.study import LOST, Launches
     [
         (["hydra/launcher=basic"], 0, 1, 8),
         (["hydra/launcher=basic"], 3, 1, 3),
-        (["hydra/launcher=joblib"], 0, 8, 1),
         (["hydra/launcher=joblib"], 4, 2, 4),
         (["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"], 0, 2, 4),
         (["hydra/launcher=joblib", "hydra.launcher.n_jobs=-3"], 0, 6, 1),
         (["hydra/launcher=joblib", "hydra.launcher.n_jobs=99"], 0, 99, 1),
-        (["hydra/launcher=submitit_local"], 0, 8, 1),
         (["hydra/launcher=submitit_local"], 3, 2, 3),
-        (["hydra/launcher=submitit_local", "hydra.launcher.cpus_per_task=4"], 0, 2, 4),
         (["hydra/launcher=submitit_local", "hydra.launcher.cpus_per_task=16"], 0, 1, 16),
         (["hydra/launcher=submitit_slurm"], 0, None, 1),
         (["hydra/launcher=submitit_slurm"], 4, None, 4),
-        (["hydra/launcher=submitit_slurm", "hydra.launcher.cpus_per_task=2"], 0, None, 2),
     ],
 )
 def test_cores_are_divided_among_the_cells_that_run_at_once(
@@ -64,16 +61,34 @@ def test_cores_are_divided_among_the_cells_that_run_at_once(
 
 
 def test_a_last_cell_has_the_machine_to_itself(composed: Callable[..., DictConfig]) -> None:
-    allowed = capacity(composed("hydra/launcher=joblib").hydra.launcher, 0, machine=8)
+    launcher = composed("hydra/launcher=joblib").hydra.launcher
+    allowed = capacity(launcher, 0, machine=8)
+    assert (allowed.at_once, allowed.threads(1000, machine=8)) == (8, 1)
     assert allowed.threads(1, machine=8) == 8
     assert allowed.threads(3, machine=8) == 2
+    none = composed("hydra/launcher=joblib", "hydra.launcher.n_jobs=0").hydra.launcher
+    with pytest.raises(XrgsError, match="n_jobs=0"):
+        capacity(none, 0, machine=8)
+
+
+def test_a_launcher_that_is_not_installed_is_named_with_its_extra(
+    composed: Callable[..., DictConfig],
+) -> None:
+    if find_spec("hydra_plugins.hydra_ray_launcher") is not None:
+        pytest.skip("ray is installed")
+    given = composed("hydra/launcher=ray", "hydra.launcher.ray.remote.num_cpus=2")
+    with pytest.raises(XrgsError, match=r"ray is not installed: pip install 'xrgs\[ray\]'"):
+        check(given)
 
 
 def test_a_ray_cluster_that_runs_already_is_given_no_size(monkeypatch: pytest.MonkeyPatch) -> None:
     def settings(address: str | None) -> Mapping[str, Any]:
         ray = {"init": {"address": address}, "remote": {}}
         launcher = OmegaConf.create({"_target_": "hydra_plugins.x.RayLauncher", "ray": ray})
-        return capacity(launcher, 2, machine=8).settings
+        allowed = capacity(launcher, 2, machine=8)
+        gpu = {"ray.remote.num_gpus": 1}
+        assert one_cell_a_gpu(launcher, allowed, 0).settings == {**allowed.settings, **gpu}
+        return allowed.settings
 
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     assert settings(None) == {"ray.remote.num_cpus": 2}
@@ -89,17 +104,12 @@ def test_a_ray_cluster_that_runs_already_is_given_no_size(monkeypatch: pytest.Mo
     [
         (["hydra/launcher=basic"], 4, 1, 8, {}),
         (["hydra/launcher=joblib"], 4, 4, 2, {"n_jobs": 4, "batch_size": 1}),
-        (["hydra/launcher=joblib"], 1, 1, 8, {"n_jobs": 1, "batch_size": 1}),
         (
             ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"],
             *(4, 2, 4, {"n_jobs": 2, "batch_size": 1}),
         ),
         (["hydra/launcher=submitit_local"], 2, 2, 4, {}),
         (["hydra/launcher=submitit_slurm"], 0, None, 1, {"cpus_per_task": 1, "gres": "gpu:1"}),
-        (
-            ["hydra/launcher=submitit_slurm", "hydra.launcher.gres='gpu:a100:1'"],
-            *(0, None, 1, {"cpus_per_task": 1}),
-        ),
         (
             ["hydra/launcher=submitit_slurm", "hydra.launcher.gpus_per_node=1"],
             *(0, None, 1, {"cpus_per_task": 1}),
@@ -120,29 +130,9 @@ def test_each_cell_of_gsplat_has_a_gpu(
     assert allowed.settings == settings
     assert allowed.threads(1000, machine=8) == cores
     assert allowed.batch in {None, at_once}
-
-
-@pytest.mark.parametrize(("remote", "asked"), [({}, 1), ({"num_gpus": 2}, 2)])
-def test_ray_is_asked_for_a_gpu(remote: Mapping[str, int], asked: int) -> None:
-    ray = {"init": {"address": "auto"}, "remote": remote}
-    launcher = OmegaConf.create({"_target_": "hydra_plugins.x.RayLauncher", "ray": ray})
-    allowed = one_cell_a_gpu(launcher, capacity(launcher, 2, machine=8), 0)
-    assert allowed.settings["ray.remote.num_gpus"] == asked
-
-
-@pytest.mark.parametrize("launcher", ["basic", "joblib", "submitit_local"])
-def test_a_machine_without_gpus_launches_no_cell_of_gsplat(
-    composed: Callable[..., DictConfig], launcher: str
-) -> None:
-    chosen = composed(f"hydra/launcher={launcher}").hydra.launcher
-    with pytest.raises(XrgsError, match=r"splat\.backend=gsplat: this machine has no GPU"):
-        one_cell_a_gpu(chosen, capacity(chosen, 0, machine=8), 0)
-
-
-def test_no_jobs_at_all_are_refused(composed: Callable[..., DictConfig]) -> None:
-    launcher = composed("hydra/launcher=joblib", "hydra.launcher.n_jobs=0").hydra.launcher
-    with pytest.raises(XrgsError, match="n_jobs=0"):
-        capacity(launcher, 0, machine=8)
+    if at_once is not None:
+        with pytest.raises(XrgsError, match=r"splat\.backend=gsplat: this machine has no GPU"):
+            one_cell_a_gpu(launcher, capacity(launcher, 0, machine=8), 0)
 
 
 @pytest.fixture
@@ -150,9 +140,9 @@ def composed(tmp_path: Path) -> Callable[..., DictConfig]:
     """(*overrides) -> a sweep's config with Hydra's own part, its store in the test's folder."""
 
     def compose(*overrides: str) -> DictConfig:
-        with hydra.initialize_config_dir(str(config.CONF_DIR), version_base="1.3"):
-            store = with_quotes([f"store={tmp_path / 's'}"])
-            return hydra.compose("config", [*store, *overrides], return_hydra_config=True)
+        made = hydra_config(*overrides)
+        made.store = str(tmp_path / "s")
+        return made
 
     return compose
 
@@ -232,7 +222,7 @@ def launch_cells(
         store.prepare()
         fake = FakeLauncher(store, fatal)
         monkeypatch.setattr(Plugins, "instantiate_launcher", fake.configured)
-        conf = compose(*with_quotes([f"store={tmp_path / 's'}"]))
+        conf = replace(compose(), store=str(tmp_path / "s"))
         cells = [planned(replace(conf, seed=seed), name) for seed, name in enumerate(names)]
         context = HydraContext(None, None)  # type: ignore[arg-type]  # launches load no config
         launches = Launches(context, len, composed(*overrides))
@@ -259,33 +249,27 @@ def test_what_a_broken_launcher_drops_is_launched_again(
     assert "lost 3 times, not tried again" in err
 
 
-def test_a_job_out_of_its_time_is_launched_again_and_another_s_failure_is_final(
-    launch_cells: Callable[..., tuple[dict[str, str], FakeLauncher]],
-) -> None:
-    outcomes, fake = launch_cells("abc", {"late a", "raise b"})
-    assert outcomes == {"a": "unfinished", "b": "failed", "c": "done"}
-    assert fake.launches == [["a", "b", "c"], ["a"], ["a"]]
-
-
-def test_a_job_that_was_asked_to_end_is_not_launched_again_nor_one_whose_cell_is_done(
+def test_a_job_out_of_its_time_is_launched_again_and_other_ends_are_final(
     launch_cells: Callable[..., tuple[dict[str, str], FakeLauncher]],
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    outcomes, fake = launch_cells("abc", {"ask a", "mute b"})
-    assert outcomes == {"a": INTERRUPTED, "b": "done", "c": "done"}
-    assert fake.launches == [["a", "b", "c"]]
-    assert "its job was asked to end; the next sweep continues it" in capsys.readouterr().err
-
-
-def test_a_launcher_that_begins_nothing_ends_the_sweep_with_its_own_words(
-    launch_cells: Callable[..., tuple[dict[str, str], FakeLauncher]],
-) -> None:
     with pytest.raises(XrgsError, match="RuntimeError: no such cluster"):
-        launch_cells("abc", {"nothing"})
+        launch_cells("ab", {"nothing"})
+    outcomes, fake = launch_cells("abcde", {"late a", "raise b", "ask d", "mute e"})
+    assert outcomes == {
+        "a": "unfinished",
+        "b": "failed",
+        "c": "done",
+        "d": INTERRUPTED,
+        "e": "done",
+    }
+    assert fake.launches == [list("abcde"), ["a"], ["a"]]
+    assert "its job was asked to end; the next sweep continues it" in capsys.readouterr().err
 
 
 def test_submitit_has_no_more_jobs_at_a_time_than_there_are_cores(
     launch_cells: Callable[..., tuple[dict[str, str], FakeLauncher]],
+    odd: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(study, "usable_cores", lambda: 4)
@@ -294,6 +278,11 @@ def test_submitit_has_no_more_jobs_at_a_time_than_there_are_cores(
     assert fake.launches == [["a", "b"], ["c", "d"], ["e"]]
     threads = [fake.store.cell(name).config().threads for name in fake.ids.values()]
     assert threads == [2] * 5
+    monkeypatch.chdir(odd)
+    for name in ("out", "out-2"):  # two calls never share a folder
+        _, fake = launch_cells("a", set(), "hydra.sweep.dir=out")
+        assert fake.config.hydra.sweep.dir == str(odd / name)
+        assert (odd / name / "sweep").is_file()
 
 
 @pytest.fixture
@@ -324,43 +313,24 @@ def test_a_job_finds_its_folders_wherever_it_runs(
     assert conf.store == "s"  # the plan's own config is not changed
 
 
-def test_a_number_of_threads_that_the_user_set_is_kept(
-    compose: Callable[..., config.Conf], store: Store
-) -> None:
-    cell = planned(compose("threads=5"), "a")
-    study._hand_over(cell, 3, store)
-    assert store.cell(str(cell.cell_id)).config().threads == 5
-
-
-def test_two_calls_never_share_a_folder(
-    launch_cells: Callable[..., tuple[dict[str, str], FakeLauncher]],
-    odd: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.chdir(odd)
-    for name in ("out", "out-2"):
-        _, fake = launch_cells("a", set(), "hydra.sweep.dir=out")
-        assert fake.config.hydra.sweep.dir == str(odd / name)
-        assert (odd / name / "sweep").is_file()
-
-
 def test_a_lease_that_the_plan_has_watched_long_enough_is_free_for_the_job(
     compose: Callable[..., config.Conf], store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A job in a process of its own has watched nothing."""
-    cell = planned(compose(), "a")
+    cell = planned(replace(compose(), threads=5), "a")
     held = lease.acquire(store.leases, str(cell.cell_id))
     assert held is not None
     monkeypatch.setattr(lease.Owner, "lives", False)
-    study._hand_over(cell, 1, store)
+    study._hand_over(cell, 3, store)
     assert not lease.names(store.leases)
+    assert store.cell(str(cell.cell_id)).config().threads == 5  # as the user has set them
 
 
 @pytest.mark.parametrize("how", ["done", "training"])
 def test_a_cell_that_another_sweep_has_begun_since_the_plan_is_left_as_it_is(
     compose: Callable[..., config.Conf], store: Store, how: str
 ) -> None:
-    ours, theirs = (planned(compose(f"threads={n}"), "a") for n in (1, 2))
+    ours, theirs = (planned(replace(compose(), threads=n), "a") for n in (1, 2))
     study._hand_over(theirs, 1, store)
     cell = store.cell(str(theirs.cell_id))
     begin_attempt(cell)
@@ -393,20 +363,14 @@ def test_a_launcher_composes_nothing_for_a_job(
     assert fake.config.hydra.job.get("num") != 7
 
 
-@pytest.mark.parametrize("name", ["0123456789012345", "12e4567890123456", "1234567890abcdef"])
-def test_an_id_that_looks_like_a_number_stays_text(
-    composed: Callable[..., DictConfig], session: SweepSession, name: str
-) -> None:
-    given = composed(*with_quotes([f"hydra.sweep.dir={session.folder}"]))
-    job = study._JobConfigLoader().load_sweep_config(given, [f"cell={name}"])
-    assert job.cell == name
-
-
-def test_a_job_of_a_sweep_whose_folder_is_gone_does_not_begin(
+def test_an_id_that_looks_like_a_number_stays_text_and_a_sweep_that_is_gone_begins_no_job(
     composed: Callable[..., DictConfig], session: SweepSession
 ) -> None:
-    """Hydra would make the folder again, and the store with it."""
     given = composed(*with_quotes([f"hydra.sweep.dir={session.folder}"]))
+    for name in ("0123456789012345", "12e4567890123456"):
+        job = study._JobConfigLoader().load_sweep_config(given, [f"cell={name}"])
+        assert job.cell == name
     session.folder.rename(session.folder.with_name("elsewhere"))
+    # Hydra would make the folder again, and the store with it.
     with pytest.raises(XrgsError, match="is no longer there"):
         study._JobConfigLoader().load_sweep_config(given, ["cell=a"])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import tempfile
 from collections.abc import Callable
@@ -12,14 +11,16 @@ from typing import Any
 
 import pytest
 
+from xrgs.store.store import Store
+
 pytestmark = pytest.mark.slow
 
-SMOKE = ("scene=motorcycle", "preset=smoke", "train.steps=4", "seed=0,1")
+SMOKE = ("scene=motorcycle", "preset=smoke", "train.steps=4", "seed=0,1", "threads=0")
 #: Folder of Ray's files; the paths of its sockets may have at most 107 bytes.
 RAY = Path(tempfile.gettempdir(), "xrgs-ray")
-#: Python loads this in every process of a sweep: each sees two cores, and a cell's process waits
-#: until another cell has begun; if the file `kill` exists, one then kills the launcher's worker. No
-#: report is made: it takes seconds, and is the same however its cells were launched.
+#: Python loads this in every process of a sweep: each sees two cores. A cell trains nothing, and
+#: ends when another cell has begun; if the file `kill` exists, one then kills the launcher's
+#: worker. No report is made.
 SITE = """
 import os, sys, time, types
 from pathlib import Path
@@ -28,41 +29,29 @@ os.sched_getaffinity = lambda pid: {0, 1}
 sys.modules["xrgs.report"] = types.ModuleType("xrgs.report")
 sys.modules["xrgs.report"].build = lambda *_: types.SimpleNamespace(text="")
 if "xrgs.sweep.job" in sys.orig_argv and "cell" in sys.orig_argv:
-    folder = Path(os.environ["SWEEPS_OF"])
-    end = time.monotonic() + 90
-    while len(list((folder / "s" / "cells").glob("*/log.txt"))) < 2:
-        if time.monotonic() > end:
+    def run_cell(conf, variant, folder, stop):
+        from xrgs.safeio.atomic import write_json
+        home = Path(os.environ["SWEEPS_OF"])
+        end = time.monotonic() + 90
+        while len(list((home / "s" / "cells").glob("*/log.txt"))) < 2:
+            if time.monotonic() > end:
+                os._exit(3)
+            time.sleep(0.05)
+        try:
+            (home / "kill").unlink()
+        except FileNotFoundError:
+            pass
+        else:
+            os.kill(os.getppid(), 9)
             os._exit(3)
-        time.sleep(0.05)
-    try:
-        (folder / "kill").unlink()
-    except FileNotFoundError:
-        pass
-    else:
-        os.kill(os.getppid(), 9)
-        os._exit(3)
+        summary = {"training_time_s": 1.5, "render_time_ms": 2, "gaussians": 7, "steps": 4}
+        write_json(folder.path / "summary.json", summary | {"memory_bytes": 1, "evaluations": 1})
+        (folder.path / "scores.csv").write_text("view,psnr\\na,20\\n")
+        folder.finish(["a"], {})
+
+    sys.modules["xrgs.store.cell"] = types.ModuleType("xrgs.store.cell")
+    sys.modules["xrgs.store.cell"].run_cell = run_cell
 """
-
-
-def results(folder: Path) -> dict[str, list[bytes]]:
-    """Return what must be the same however a cell was launched, by its id."""
-    names = ("scores.csv", "splats.ply", "identity.json")
-    done = sorted((folder / "s" / "cells").glob("*/status.json"))
-    return {file.parent.name: [(file.parent / n).read_bytes() for n in names] for file in done}
-
-
-@pytest.fixture(scope="module")
-def basic(
-    tmp_path_factory: pytest.TempPathFactory,
-    forked_command: Callable[..., tuple[int, str, str]],
-    smoke_variants: Path,
-) -> Path:
-    """A folder whose store `s` holds the cells that the basic launcher trained."""
-    folder = tmp_path_factory.mktemp("basic")
-    shutil.copytree(smoke_variants, folder / "s" / "variants")
-    code, _, err = forked_command("sweep", folder, *SMOKE, "store=s", "threads=1")
-    assert code == 0, err
-    return folder
 
 
 @pytest.fixture
@@ -72,6 +61,12 @@ def folder(smoke_variants: Path, tmp_path: Path) -> Path:
     return tmp_path
 
 
+def done(folder: Path) -> list[int]:
+    """The threads of the cells that are done."""
+    cells = Store(folder / "s").cell_folders()
+    return [cell.config().threads for cell in cells if cell.state().name == "done"]
+
+
 @pytest.mark.parametrize(
     ("launcher", "package", "settings"),
     [
@@ -79,8 +74,7 @@ def folder(smoke_variants: Path, tmp_path: Path) -> Path:
         ("ray", "ray", (f"+hydra.launcher.ray.init={{num_cpus:2,_temp_dir:{RAY}}}",)),
     ],
 )
-def test_a_launcher_runs_two_cells_at_once_to_the_results_of_basic(
-    basic: Path,
+def test_a_launcher_runs_two_cells_at_once(
     folder: Path,
     sweeps_in: Callable[..., Any],
     launcher: str,
@@ -89,19 +83,16 @@ def test_a_launcher_runs_two_cells_at_once_to_the_results_of_basic(
 ) -> None:
     if find_spec(f"hydra_plugins.hydra_{package}_launcher") is None:
         pytest.skip(f"pip install 'xrgs[{package}]', which is large")
-    given = (f"hydra/launcher={launcher}", *settings, "threads=0")
-    code, _, err = sweeps_in(folder, SITE).run(*SMOKE, *given)
+    code, _, err = sweeps_in(folder, SITE).run(*SMOKE, f"hydra/launcher={launcher}", *settings)
     assert code == 0, err
-    assert results(folder) == results(basic)
-    for cell in (folder / "s" / "cells").iterdir():
-        assert json.loads((cell / "provenance.json").read_text())["threads"] == 1
+    assert done(folder) == [1, 1]  # of two cores
 
 
 def test_joblib_runs_two_cells_at_once_and_a_killed_worker_costs_nothing(
-    basic: Path, folder: Path, sweeps_in: Callable[..., Any]
+    folder: Path, sweeps_in: Callable[..., Any]
 ) -> None:
     (folder / "kill").touch()
-    two = ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "threads=0")
+    two = ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2")
     code, _, err = sweeps_in(folder, SITE).run(*SMOKE, *two)
     assert code == 0, err
     assert not (folder / "kill").exists()
@@ -109,15 +100,4 @@ def test_joblib_runs_two_cells_at_once_and_a_killed_worker_costs_nothing(
     assert "of its 2 cells these are not finished:" in err
     # Both begin and both begin again; the pool may break before the second has begun.
     assert err.count("training cell") in (3, 4)
-    assert results(folder) == results(basic)
-
-
-def test_a_launcher_that_is_not_installed_is_named_with_its_extra(
-    tmp_path: Path, sweeps_in: Callable[..., Any]
-) -> None:
-    if find_spec("hydra_plugins.hydra_ray_launcher") is not None:
-        pytest.skip("ray is installed")
-    ray = ("hydra/launcher=ray", "hydra.launcher.ray.remote.num_cpus=2")
-    code, _, err = sweeps_in(tmp_path).run(*ray, "dry_run=true")
-    assert code == 1
-    assert "pip install 'xrgs[ray]'" in err
+    assert len(done(folder)) == 2

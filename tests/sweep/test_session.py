@@ -28,11 +28,6 @@ def test_a_session_is_over_when_it_is_stopped_or_its_process_has_ended(
         assert str(session.stopped) == "the first"
 
 
-def test_a_disk_too_full_for_the_reason_stops_the_jobs_all_the_same(session: SweepSession) -> None:
-    (session.folder / "stopped").touch()
-    assert session.stopped == f"{session.folder / 'stopped'} exists"
-
-
 def test_a_session_whose_folder_is_gone_is_over_and_does_not_reappear(
     session: SweepSession,
 ) -> None:
@@ -55,23 +50,18 @@ def test_a_reason_that_can_not_be_read_now_stops_nothing(
     assert str(session.stopped) == "enough [31m of it"
 
 
-def test_something_else_with_the_name_of_the_reason_stops_the_jobs(session: SweepSession) -> None:
-    (session.folder / "stopped").mkdir()
-    assert session.stopped == f"{session.folder / 'stopped'} exists"
-
-
-def test_the_folder_of_a_session_that_is_over_is_removed(session: SweepSession) -> None:
-    (session.folder / "0").mkdir()
-    session.stop("a cell failed")
-    session.end()
-    assert not session.folder.exists()
-    session.end()
-
-
-def test_the_logs_of_a_launcher_stay_and_the_session_with_them(session: SweepSession) -> None:
+def test_the_folder_of_a_session_that_is_over_is_removed_without_logs(
+    session: SweepSession,
+) -> None:
     log = session.folder / ".submitit" / "log"
     log.parent.mkdir()
     log.touch()
     session.end()
     assert log.exists()
     assert session.exists
+    log.unlink()
+    (session.folder / "stopped").touch()  # a disk too full for the reason
+    assert session.stopped == f"{session.folder / 'stopped'} exists"
+    session.end()
+    assert not session.folder.exists()
+    session.end()

@@ -64,56 +64,29 @@ def test_a_store_that_was_moved_is_gone_and_says_where_its_cells_are(
         store.check_not_gone()
 
 
-@pytest.mark.parametrize("number", [errno.EACCES, errno.EIO, errno.ESTALE])
 def test_a_store_that_can_not_be_looked_at_now_is_not_gone(
-    store: Store, monkeypatch: pytest.MonkeyPatch, number: int
+    store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(path: Path, **_: object) -> os.stat_result:
-        raise OSError(number, os.strerror(number), str(path))
+        raise OSError(errno.ESTALE, os.strerror(errno.ESTALE), str(path))
 
     monkeypatch.setattr(Path, "stat", fail)
     store.check_not_gone()
 
 
-def wait_for(what: Callable[[], object], sweep: Any) -> None:
-    end = time.monotonic() + 60
-    while not what():
-        assert sweep.process.poll() is None
-        assert time.monotonic() < end
-        time.sleep(0.005)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(("vanishes", "launcher"), [(unmount, "basic"), (delete, "joblib")])
 def test_a_sweep_whose_store_vanishes_ends_in_order(
-    sweeps_in: Callable[..., Any],
-    smoke_variants: Path,
-    tmp_path: Path,
-    vanishes: Callable[[Path], None],
-    launcher: str,
+    sweeps_in: Callable[..., Any], smoke_variants: Path, tmp_path: Path
 ) -> None:
     shutil.copytree(smoke_variants, tmp_path / "s" / "variants")
     sweeps = sweeps_in(tmp_path, WRITES_ON)
-    given = ("scene=motorcycle", "preset=smoke", "seed=0,1", f"hydra/launcher={launcher}")
-    sweep = sweeps.start(*given)
-    wait_for((tmp_path / "begun").exists, sweep)
-    vanishes(tmp_path / "s")
-    ended_in_order(sweeps, sweep, tmp_path, vanishes)
-
-
-@pytest.mark.slow
-def test_a_sweep_whose_store_vanishes_while_a_variant_is_built_ends_in_order(
-    sweeps_in: Callable[..., Any], tmp_path: Path
-) -> None:
-    sweeps = sweeps_in(tmp_path)
-    sweep = sweeps.start("scene=motorcycle", "preset=smoke")
-    wait_for(lambda: list(tmp_path.glob("s/variants/.*.building")), sweep)
+    sweep = sweeps.start("scene=motorcycle", "preset=smoke", "seed=0,1")
+    end = time.monotonic() + 60
+    while not (tmp_path / "begun").exists():
+        assert sweep.process.poll() is None
+        assert time.monotonic() < end
+        time.sleep(0.02)
     delete(tmp_path / "s")
-    ended_in_order(sweeps, sweep, tmp_path, delete)
-
-
-def ended_in_order(sweeps: Any, sweep: Any, folder: Path, vanishes: Callable[[Path], None]) -> None:
-    """Assert that a sweep says once what happened, leaves no process, and makes nothing again."""
     code, out, err = sweep.end()
     sweeps.leave_nothing_running()
     assert code == 1, err
@@ -121,7 +94,5 @@ def ended_in_order(sweeps: Any, sweep: Any, folder: Path, vanishes: Callable[[Pa
     assert "store=s: it is no longer there" in err
     for noise in ("Traceback", "Error", "SIGTERM", "failed"):
         assert noise not in out + err
-    if vanishes is unmount:
-        (folder / "s").rmdir()  # it is empty
-    assert not (folder / "s").exists()
-    assert not list((folder / "tmp").glob("xrgs-*"))
+    assert not (tmp_path / "s").exists()
+    assert not list((tmp_path / "tmp").glob("xrgs-*"))

@@ -18,7 +18,7 @@ import re
 import shutil
 import stat
 import tarfile
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
@@ -33,14 +33,13 @@ from xrgs.runtime.progress import progress
 from xrgs.runtime.text import listed
 from xrgs.safeio.atomic import atomic_writer, json_text
 from xrgs.safeio.files import is_inside, is_name, remove_path, sync_name, sync_tree, walk_files
-from xrgs.safeio.hashing import digest
 from xrgs.safeio.records import errors_named, read_file, read_struct, read_table
 from xrgs.safeio.sanitize import counted, for_line
 from xrgs.store import texture, trimming
 from xrgs.store.cell_folder import CONFIG, NOT_RESULTS, STATUS, CellFolder, CellState
 from xrgs.store.identity import cell_id
-from xrgs.store.schema import FileEntry, SweepRecord
-from xrgs.store.store import MAX_RECORD_BYTES
+from xrgs.store.schema import FileEntry
+from xrgs.store.store import unchanged_record
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -69,7 +68,7 @@ class Packed:
     bytes: int
     """The size of the archive."""
     left_out: tuple[str, ...]
-    """A line for each cell, variant and record that should have been packed, with the reason."""
+    """A line for each cell, variant and record that is damaged or can't be read now."""
 
     def __str__(self) -> str:
         return _counts(self.cells, self.variants, self.sweeps)
@@ -88,10 +87,6 @@ def pack(
             elsewhere only the last name is kept.
         sweeps: Ids of the sweeps whose records are packed; empty for all that have such a cell.
 
-    Returns:
-        The numbers of packed cells, variants and records, and a line for each that is damaged or
-        can't be read now, and was left out.
-
     Raises:
         StoreError: `out` can't be written, or the store can't be read.
     """
@@ -106,23 +101,13 @@ def pack(
 
     done = {cell: files for cell in cells if (files := packed(cell.id, partial(_cell, cell, here)))}
     variant_ids = sorted({cell.identity().variant for cell in done})
-    sweep_ids = sorted(sweeps or _sweeps_of(store, {cell.id for cell in done}))
+    sweep_ids = sorted(sweeps or store.sweeps_of(*(cell.id for cell in done)))
     variants = [packed(name, partial(_variant, store, name)) for name in variant_ids]
     records = [packed(name, partial(_record, store, name, here)) for name in sweep_ids]
     with errors_named(out):
         size = _write(out, [*done.values(), *variants, *records])
     counts = [len(items) - items.count({}) for items in (variants, records)]
     return Packed(len(done), counts[0], counts[1], size, tuple(left_out))
-
-
-def _sweeps_of(store: Store, cell_ids: set[str]) -> set[str]:
-    """Return the ids of the sweeps that have one of some cells."""
-    records, _ = store.records()
-    return {
-        sweep_id
-        for sweep_id, record in records.items()
-        if any(row.cell_id in cell_ids for row in record.cells)
-    }
 
 
 def _write(out: Path, groups: Iterable[_Files]) -> int:
@@ -173,8 +158,8 @@ def _variant(store: Store, variant_id: str) -> _Files:
 
 
 def _record(store: Store, sweep_id: str, here: Path) -> _Files:
-    store.verify_sweep(sweep_id)
-    record, file = store.sweep_record(sweep_id), store.sweeps / f"{sweep_id}.json"
+    file = store.sweeps / f"{sweep_id}.json"
+    record = unchanged_record(file)
     command = tuple(_relative_argument(word, here) for word in record.command)
     text = json_text(msgspec.to_builtins(msgspec.structs.replace(record, command=command)))
     return {f"sweeps/{file.name}": (text.encode(), file.stat().st_mtime)}
@@ -203,7 +188,7 @@ def _relative_argument(word: str, here: Path) -> str:
 #: Name of the hidden folders, in the store and beside the final places, where items are put first.
 _STAGING = ".importing"
 _ID = "[0-9a-f]{16}"
-#: Folder of a kind of items -> the names that its items have.
+#: Folder of a kind of items in a store -> the names that its items have.
 _NAMES = {
     "variants": re.compile(f"(trimmed-)?{_ID}-{_ID}"),
     "scenes": re.compile(_ID),
@@ -247,19 +232,16 @@ def import_store(source: Path, store: Store) -> Imported:
         source: The archive (`.tar`, `.tar.xz`, `.tar.gz`, `.tar.bz2`), or the folder of a store.
         store: The store to copy to; it is made where it is missing.
 
-    Returns:
-        The numbers of imported items, and a line for each reason why items were left out.
-
     Raises:
         StoreError: The source is no store; an archive is damaged, or has a link or a name outside
             its folder; or the store can't be written.
     """
     store.prepare()
     with errors_named(store.path), lease.waited_for(store.path, ".import.lock"):
-        importing = _Import(store)
+        importing = _Import(store.path)
         importing.clear()
         try:
-            return importing.copy_all(_root(source, importing.unpacked))
+            return importing.copy_all(_root(source, store.path / _STAGING))
         finally:
             importing.clear()
 
@@ -303,44 +285,29 @@ def _regular_files(member: tarfile.TarInfo, folder: str) -> tarfile.TarInfo | No
     return member
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Import:
     """Copies intact items. An item is a cell, a variant, a scene or the record of a sweep."""
 
-    store: Store
-    left_out: dict[str, list[str]] = field(default_factory=dict)
-    """Reason -> the names of the items that are left out for it."""
-
-    @property
-    def unpacked(self) -> Path:
-        """The hidden folder for the content of an archive."""
-        return self.store.path / _STAGING
-
-    def homes(self) -> dict[str, Path]:
-        """Return the folder of each kind of item."""
-        store = self.store
-        return {
-            "variants": store.variants,
-            "scenes": store.scenes,
-            "cells": store.cells_folder,
-            "sweeps": store.sweeps,
-        }
+    home: Path
+    """The folder of the store. Each kind of item is in a folder of it, as in any store."""
 
     def clear(self) -> None:
         """Remove the hidden folders, also those of an import that was stopped."""
-        for home in (self.store.path, *self.homes().values()):
-            remove_path(home / _STAGING)
+        for folder in (self.home, *(self.home / kind for kind in _NAMES)):
+            remove_path(folder / _STAGING)
 
     def copy_all(self, root: Path) -> Imported:
         """Check each item of a folder, and copy it to its place in the store."""
         items = [
             path
-            for kind in self.homes()
+            for kind in _NAMES
             if (root / kind).is_dir()
             for path in sorted((root / kind).iterdir())
             if not _PASSED_OVER.fullmatch(path.name)
         ]
-        count, present = dict.fromkeys(self.homes(), 0), 0
+        count, present = dict.fromkeys(_NAMES, 0), 0
+        left_out: dict[str, list[str]] = {}
         for item in progress(items, "importing", "item"):
             kind = item.parent.name
             try:
@@ -348,11 +315,11 @@ class _Import:
                 copied = not self._is_present(item) and self._copy(item)
             except XrgsError as error:
                 message = str(error).replace(f"{item}/", "").replace(str(item), "it")
-                self.left_out.setdefault(message, []).append(f"{kind}/{item.name}")
+                left_out.setdefault(message, []).append(f"{kind}/{item.name}")
                 continue
             count[kind] += copied
             present += not copied
-        lines = (f"{listed(names)}: {why}" for why, names in self.left_out.items())
+        lines = (f"{listed(names)}: {why}" for why, names in left_out.items())
         return Imported(**count, present=present, left_out=tuple(map(for_line, lines)))
 
     def _check(self, item: Path) -> None:
@@ -369,7 +336,7 @@ class _Import:
             _CHECKS[kind](item)
 
     def _is_present(self, item: Path) -> bool:
-        home = self.homes()[item.parent.name]
+        home = self.home / item.parent.name
         if item.parent.name != "variants":
             return (home / item.name).exists()
         variant_id = paths.id_of(item.name)  # of a variant, with its images or trimmed
@@ -377,7 +344,7 @@ class _Import:
 
     def _copy(self, item: Path) -> bool:
         """Copy an item; return False where another process made it meanwhile."""
-        home = self.homes()[item.parent.name]
+        home = self.home / item.parent.name
         staged = home / _STAGING / item.name
         files = [name for name, _ in walk_files(item)] if item.is_dir() else [""]
         for name in files:
@@ -436,17 +403,11 @@ def _check_scene(folder: Path) -> None:
         raise StoreError("; ".join(damage))
 
 
-def _check_record(file: Path) -> None:
-    record = read_struct(file, SweepRecord, MAX_RECORD_BYTES)
-    if digest(msgspec.to_builtins(record.cells)) != record.digest:
-        raise StoreError("its cells have changed since it was written")
-
-
-_CHECKS: dict[str, Callable[[Path], None]] = {
+_CHECKS: dict[str, Callable[[Path], object]] = {
     "variants": _check_variant,
     "scenes": _check_scene,
     "cells": _check_cell,
-    "sweeps": _check_record,
+    "sweeps": unchanged_record,
 }
 
 

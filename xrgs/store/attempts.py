@@ -13,6 +13,7 @@ import secrets
 import shutil
 from contextlib import suppress
 from dataclasses import asdict
+from itertools import count
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -34,9 +35,6 @@ def plan_cell(cell: CellFolder, conf: Conf, identity: Identity) -> None:
     """Write the config and the identity of a cell that no process is training.
 
     Files of an earlier attempt stay until the next one begins.
-
-    Raises:
-        OSError: The store can't be written.
     """
     cell.path.mkdir(exist_ok=True)
     # Not durable: when the power goes, the sweep that has planned the cell is over.
@@ -51,28 +49,27 @@ def begin_attempt(cell: CellFolder, is_owner: Callable[[], bool] = lambda: True)
     a stopped attempt. A folder that can't be resumed (failed without a checkpoint, or corrupt) is
     renamed to `<cell id>.aside-<n>`, so that it can be inspected.
 
-    Args:
-        cell: The cell, whose lease the caller holds.
-        is_owner: Returns whether the lease is still held. It is asked right before the folder is
-            replaced.
+    The caller holds the cell's lease. Right before the folder is replaced, `is_owner` is asked
+    whether it still does.
 
     Returns:
         False where the lease was lost; nothing has changed then.
 
     Raises:
         UnreadableError: A file can't be read now.
-        OSError: The store can't be written.
     """
     folder = cell.path
     stopped = _stopped(cell)
     new, old = _hidden(folder, "new"), _hidden(folder, "old")
     try:
         new.mkdir()
-        _copy_if_there(folder / CONFIG, new)
-        _copy_if_there(folder / IDENTITY, new)
-        if stopped is not None:
-            _copy_if_there(stopped.checkpoint, new)
-            _copy_if_there(stopped.path / LOG, new)
+        files = [folder / CONFIG, folder / IDENTITY]
+        files += [stopped.checkpoint, stopped.path / LOG] if stopped else []
+        for file in files:
+            # Not moved: until the new attempt is in place the old one must be whole, and its
+            # process may have the log open.
+            if file.is_file():
+                shutil.copyfile(file, new / file.name)
         (new / LOG).touch()  # from now on the cell has begun
         sync_tree(new)
         if not is_owner():
@@ -95,9 +92,6 @@ def remove_cell(cell: CellFolder) -> None:
 
     The folder is renamed first. If a kill leaves a part of it, that part is no cell: the next
     attempt or `xrgs-store gc` removes it.
-
-    Raises:
-        OSError: The cell can't be removed.
     """
     renamed = _hidden(cell.path, "new")
     cell.path.rename(renamed)
@@ -138,22 +132,12 @@ def _leftovers(folder: Path, kind: str) -> list[CellFolder]:
 def _settle_leftovers(folder: Path) -> None:
     """Remove stopped attempts, which the new one resumes; keep every other one aside."""
     for old in _leftovers(folder, "old"):
-        name = _hidden(folder, "new") if _can_resume(old) else _free_name(folder)
+        name = _hidden(folder, "new") if _can_resume(old) else free_name(folder, "aside")
         old.path.rename(name)
         # After a power failure, a folder that was half removed must not pass for an attempt.
         sync_name(name)
     for new in _leftovers(folder, "new"):
         _remove(new.path)
-
-
-def _copy_if_there(file: Path, folder: Path) -> None:
-    """Copy a file into a folder.
-
-    It is not moved: until the new attempt is in place the old one must be whole, and its process
-    may have the log open.
-    """
-    if file.is_file():
-        shutil.copyfile(file, folder / file.name)
 
 
 def _remove(folder: Path) -> None:
@@ -166,9 +150,7 @@ def _remove(folder: Path) -> None:
         remove_path(folder)
 
 
-def _free_name(path: Path) -> Path:
-    """Return the first sibling that does not exist: `<name>.aside-1`, `<name>.aside-2`, ..."""
-    number = 1
-    while (free := path.with_name(f"{path.name}.aside-{number}")).exists():
-        number += 1
-    return free
+def free_name(path: Path, kind: str) -> Path:
+    """Return the first sibling that does not exist: `<name>.<kind>-1`, `<name>.<kind>-2`, ..."""
+    names = (path.with_name(f"{path.name}.{kind}-{number}") for number in count(1))
+    return next(name for name in names if not name.exists())

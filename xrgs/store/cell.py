@@ -69,12 +69,9 @@ class CellCheckpoint(Checkpoint):
     ) -> None:
         """Prepare the checkpoint of a cell; nothing is written yet.
 
-        Args:
-            folder: The cell's folder.
-            every_s: Seconds between two writes; 0 never writes, not even when the cell is stopped.
-            shown: The progress, whose note gets the number of Gaussians, the loss and the PSNR.
-            stop: Whether the process was asked to end; read after every step.
-            curves: Whether the history is written during training, too.
+        With `every_s` of 0 it is never written, not even when the cell is stopped. The note of
+        `shown` gets the number of Gaussians, the loss and the PSNR. Without `curves` the history is
+        not written during training.
         """
         super().__init__(folder.checkpoint, folder.id, every_s)
         self._folder = folder
@@ -98,12 +95,6 @@ class CellCheckpoint(Checkpoint):
 
     def save_if_due(self, step: int) -> float:
         """Write the checkpoint if the interval has passed or the process is to end.
-
-        Args:
-            step: The step that has just ended, from 0.
-
-        Returns:
-            The seconds that writing took.
 
         Raises:
             StopSignal: The process was asked to end; the checkpoint is written.
@@ -148,10 +139,7 @@ def _note(recorder: TrainingRecorder) -> str:
 def write_curves(
     folder: CellFolder, history: Sequence[Mapping[str, Any]], scores: Sequence[Mapping[str, Any]]
 ) -> None:
-    """Write the record of a training: `history.csv`, and `quality.csv` if it was evaluated.
-
-    They are not synced here: `CellFolder.finish` syncs all files.
-    """
+    """Write the record of a training: `history.csv`, and `quality.csv` if it was evaluated."""
     if scores:
         write_text(folder.path / "quality.csv", table_text(scores), durable=False)
     write_text(folder.path / "history.csv", table_text(history), durable=False)
@@ -162,12 +150,9 @@ def run_cell(
 ) -> None:
     """Train and evaluate a cell, and write its results; its status is written last.
 
-    Args:
-        conf: The cell's config.
-        variant: The frozen variant that the cell trains on.
-        folder: The cell's folder, with the config and the identity of `begin_attempt`.
-        stop: A request to end: the cell stops after the current step of training. An evaluation is
-            not stopped, since it is nearly done and would begin again from the last checkpoint.
+    The folder is as `begin_attempt` leaves it. When it is asked to `stop`, the cell stops after the
+    current step of training. An evaluation is not stopped, since it is nearly done and would begin
+    again from the last checkpoint.
 
     Raises:
         StopSignal: The cell was stopped; its checkpoint is written.
@@ -188,10 +173,7 @@ def run_cell(
 def _train_and_score(
     conf: Conf, variant: Variant, folder: CellFolder, shown: ProgressFile, stop: StopRequest
 ) -> list[str]:
-    """Write every file but the status; return the names of the scored views.
-
-    The files are not synced here: `CellFolder.finish` syncs all of them.
-    """
+    """Write every file but the status, without a sync; return the names of the scored views."""
     threads = set_torch_threads(conf.threads)
     backend = resolve_backend(conf.splat.backend)
     what = provenance.collect(threads, backend)

@@ -53,8 +53,7 @@ class CellState:
     `corrupt` or `done`."""
     reason: str = ""
     unreadable: bool = False
-    """Whether the state is `failed` only because a file can't be read now. The cell may be done,
-    and is not changed."""
+    """Whether it is `failed` only because a file can't be read now: the cell may be done."""
 
     @classmethod
     def of_error(cls, error: StoreError | OSError) -> CellState:
@@ -81,7 +80,7 @@ class CellFolder:
 
     @property
     def checkpoint(self) -> Path:
-        """File of the training checkpoint; it exists while the cell is not done."""
+        """File of the training checkpoint, while the cell is not done."""
         return self.path / CHECKPOINT
 
     @property
@@ -96,12 +95,21 @@ class CellFolder:
 
     # State
 
-    def state(self, *, verify: bool = True) -> CellState:
+    def state(self, *, verify: bool = True, owner: str | None = None) -> CellState:
         """Return whether this cell's result is present and intact.
 
         Args:
             verify: Hash the files that reports are made from; otherwise only sizes are compared.
+            owner: Describes the process that holds the cell's lease: it trains the cell, unless
+                that is done.
         """
+        state = self._state(verify=verify)
+        if owner is None or state.name == "done":
+            return state
+        now = progress.read(self.progress)
+        return CellState("running", f"by {owner}" + (f": {now}" if now else ""))
+
+    def _state(self, *, verify: bool) -> CellState:
         try:
             try:
                 self.status_file.stat()  # `exists` hides errors that pass, from Python 3.14 on
@@ -128,10 +136,9 @@ class CellFolder:
         return CellState("unfinished", "it was stopped before it ended")
 
     def steps_to_resume(self) -> int:
-        """Return the number of steps, about, that the next attempt takes from the checkpoint.
+        """Return about how many steps the next attempt takes from the checkpoint.
 
-        They are counted in the history, which is written as the training goes on; 0 where the cell
-        has no checkpoint or its history can't be read.
+        They are counted in the history; 0 without a checkpoint or a readable history.
         """
         if not self.checkpoint.exists():
             return 0
@@ -140,11 +147,6 @@ class CellFolder:
             return int(dict(zip(header, rows[-1], strict=True))["step"]) + 1
         except (StoreError, LookupError, ValueError):
             return 0
-
-    def running(self, owner: str) -> CellState:
-        """Return the state of a cell that a process is training; `owner` describes the process."""
-        now = progress.read(self.progress)
-        return CellState("running", f"by {owner}" + (f": {now}" if now else ""))
 
     def _check(self, status: Status, *, verify: bool) -> None:
         """Raise `StoreError` where a file of a done cell is missing or has changed."""
@@ -171,6 +173,11 @@ class CellFolder:
             A line for each file that is missing, damaged, has changed, can't be read or does
             not belong there; empty for an intact cell.
         """
+        decoders = {
+            IDENTITY: self.identity,
+            "summary.json": self.summary,
+            "provenance.json": self.provenance,
+        }
         try:
             status = self.status()
             damage = [d for name, entry in status.files.items() if (d := self._damage(name, entry))]
@@ -180,25 +187,15 @@ class CellFolder:
                 for name, _ in walk_files(self.path)
                 if name not in listed
             ]
-            if not damage:
-                self._decode(status)
+            for name in () if damage else decoders.keys() & status.files.keys():
+                decoders[name]()
         except (StoreError, OSError) as error:
             reason = CellState.of_error(error).reason.replace(f"{self.path}/", "")
             return [f"{self.path}: {reason}"]
         return damage
 
-    def _decode(self, status: Status) -> None:
-        """Raise `StoreError` where a JSON file of a done cell is not of its type."""
-        structs: dict[str, type[msgspec.Struct]] = {
-            IDENTITY: Identity,
-            "summary.json": Summary,
-            "provenance.json": Provenance,
-        }
-        for name in structs.keys() & status.files.keys():
-            read_struct(self.path / name, structs[name])
-
     def _damage(self, name: str, entry: FileEntry) -> str:
-        """Return a line that says how a file differs from its entry; empty where it is intact."""
+        """Say how a file differs from its entry; empty where it is intact."""
         try:
             intact = file_digest(self.path / name) == entry.sha256
         except OSError as error:
@@ -218,30 +215,22 @@ class CellFolder:
             scored_by: Digests of the code that scored, see `xrgs.store.scoring`.
         """
         sync_tree(self.path)
-        files = {
-            name: FileEntry(status.st_size, file_digest(self.path / name))
-            for name, status in sorted(walk_files(self.path))
-            if name not in NOT_RESULTS
-        }
+        names = sorted(name for name, _ in walk_files(self.path) if name not in NOT_RESULTS)
+        files = {name: self._entry(name) for name in names}
         self._write_status(
             Status("done", views=tuple(views), files=files, scored_by=dict(scored_by))
         )
         self.drop_checkpoint()  # last: a cell that is killed before still needs it
 
     def rescored(self, names: Sequence[str], scored_by: Mapping[str, str]) -> None:
-        """Keep new scores of a done cell: the caller has written them and holds the lease.
-
-        Args:
-            names: Files that were written anew.
-            scored_by: Digests of the code that scored.
-        """
+        """Keep new scores of a done cell, in files of these names; the caller holds the lease."""
         status = self.status()
-        new = {
-            name: FileEntry((self.path / name).stat().st_size, file_digest(self.path / name))
-            for name in names
-        }
-        files = status.files | new
+        files = status.files | {name: self._entry(name) for name in names}
         self._write_status(msgspec.structs.replace(status, files=files, scored_by=dict(scored_by)))
+
+    def _entry(self, name: str) -> FileEntry:
+        file = self.path / name
+        return FileEntry(file.lstat().st_size, file_digest(file))
 
     def fail(self, reason: str) -> None:
         """Declare the cell failed, and write `error.txt` if its process did not."""
@@ -261,11 +250,7 @@ class CellFolder:
     # Trimming
 
     def trimmed_status(self) -> Status:
-        """Return the status that a done cell has once it is trimmed.
-
-        Raises:
-            StoreError: The status can't be read, or the cell is not done.
-        """
+        """Return the status that a cell has once it is trimmed; `StoreError` if it is not done."""
         status = self.status()
         if status.state != "done":
             raise StoreError(f"{self.status_file}: the cell is not done")
@@ -280,8 +265,7 @@ class CellFolder:
         between is done, and the next call removes the rest.
 
         Raises:
-            StoreError: The status can't be read, or the cell is not done.
-            OSError: A file can't be removed.
+            StoreError: The cell is not done.
         """
         status = self.trimmed_status()
         self._write_status(status)
@@ -299,11 +283,7 @@ class CellFolder:
             return False
 
     def check_not_trimmed(self, name: str) -> None:
-        """Refuse a file that was removed on purpose; the message says how to make it again.
-
-        Raises:
-            StoreError: The file was removed.
-        """
+        """Raise `StoreError` where a file was removed on purpose; it says how to make it again."""
         if self.status_file.exists() and name in self.status().trimmed:
             raise StoreError(
                 f"cells/{self.id}/{name} was removed by xrgs-store trim; xrgs-sweep rerun= trains"

@@ -20,15 +20,10 @@ _SOURCES = ("xrgs", "conf", "sweeps", "hydra_plugins")
 
 
 def of_checkout(root: Path) -> dict[str, str | None] | None:
-    """Return the commit of a checkout, `git`, and the hash of its changed sources.
+    """Return the commit of a checkout and the hash of its changed sources, as in `Provenance`.
 
-    Args:
-        root: The root of the checkout.
-
-    Returns:
-        `git` and `git_diff_sha256` as in `xrgs.store.schema.Provenance`; None where the folder
-        is not itself the root of a checkout, though it may be inside another one, or where git
-        can't tell.
+    None where the folder is not itself the root of a checkout, though it may be inside another one,
+    or where git can't tell.
     """
     if not (root / ".git").exists():  # a file in a worktree
         return None

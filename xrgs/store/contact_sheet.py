@@ -102,28 +102,19 @@ def _tile(view: View, image: Image.Image | None, largest: int) -> Image.Image:
 
 
 def _draw_image(tile: Image.Image, image: Image.Image, largest: int) -> None:
-    """Draw the whole image, and its centre beside it."""
-    whole = _fit(image)
+    """Draw the whole image, averaged where it shrinks, and its centre beside it."""
+    box, nearest = Image.Resampling.BOX, Image.Resampling.NEAREST
+    scale = min(_BOX[0] / image.width, _BOX[1] / image.height)
+    size = max(1, round(image.width * scale)), max(1, round(image.height * scale))
+    whole = image.resize(size, box if scale < 1 else nearest)
     left = _BORDER + (_BOX[0] - whole.width) // 2
     tile.paste(whole, (left, _BORDER + (_BOX[1] - whole.height) // 2))
     magnified = min(_CENTRE, max(1, round(largest / max(image.size))))
-    tile.paste(_crop_centre(image, magnified), (_BOX[0] + 2 * _BORDER, _BORDER))
-
-
-def _fit(image: Image.Image) -> Image.Image:
-    """Fit the whole image into the box: averaged where it shrinks, else with square pixels."""
-    scale = min(_BOX[0] / image.width, _BOX[1] / image.height)
-    size = max(1, round(image.width * scale)), max(1, round(image.height * scale))
-    return image.resize(size, Image.Resampling.BOX if scale < 1 else Image.Resampling.NEAREST)
-
-
-def _crop_centre(image: Image.Image, magnified: int) -> Image.Image:
-    """Cut out the centre of the image, _CENTRE px a side, each pixel `magnified` px wide."""
     side = math.ceil(_CENTRE / magnified)
     left, top = (image.width - side) // 2, (image.height - side) // 2
     cut = image.crop((left, top, left + side, top + side))
-    large = cut.resize((side * magnified, side * magnified), Image.Resampling.NEAREST)
-    return large.crop((0, 0, _CENTRE, _CENTRE))
+    large = cut.resize((side * magnified, side * magnified), nearest)
+    tile.paste(large.crop((0, 0, _CENTRE, _CENTRE)), (_BOX[0] + 2 * _BORDER, _BORDER))
 
 
 def _legend(sheet: Image.Image, variant: Variant, views: Sequence[View]) -> None:

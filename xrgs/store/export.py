@@ -57,15 +57,18 @@ def export(path: Path, layout: str, out: Path) -> str:
     if layout not in _LAYOUTS:
         raise XrgsError(f"format={layout}: must be one of {', '.join(_LAYOUTS)}")
     from xrgs.formats.ply import save_ply
+    from xrgs.mixture import variant
+    from xrgs.training import dataset
 
     cell = _cell(path)
-    variant, data = _load(path, cell)
+    frozen = variant.load(path) if cell is None else cell.variant()
+    data = dataset.load(frozen) if cell is None else cell.dataset()
     try:
         out.mkdir(parents=True, exist_ok=True)
         if any(out.iterdir()):
             raise XrgsError(f"out={out}: is not empty; name a new folder")
         images = _write_images(data, out)
-        write_json(out / "transform.json", {"sfm_to_export": transform(variant).tolist()})
+        write_json(out / "transform.json", {"sfm_to_export": transform(frozen).tolist()})
         _LAYOUTS[layout](data, images, out)
         if cell is not None:
             # Not a copy: cells of older versions have no tag of antialiased Gaussians.
@@ -90,7 +93,7 @@ def export_splats(path: Path, form: str, out: Path) -> str:
         out: The file, which is replaced.
 
     Returns:
-        A line with the number of Gaussians that were written, and of those that the cell has.
+        A line with the number of Gaussians.
 
     Raises:
         XrgsError: The cell or the file can't be read, or `out` ends otherwise or can't be written.
@@ -122,16 +125,10 @@ def export_splats(path: Path, form: str, out: Path) -> str:
 
 
 def without_invisible(gaussians: Gaussians, alpha_min: float) -> Gaussians:
-    """Leave out the Gaussians that no render shows, because their opacity is below `alpha_min`.
+    """Return new Gaussians without those that no render shows, and without gradients.
 
-    A training leaves them behind where Gaussians fade after its last removal.
-
-    Args:
-        gaussians: N Gaussians.
-        alpha_min: The renderer skips contributions below it (`splat.raster.alpha_min`).
-
-    Returns:
-        New Gaussians, without gradients. Their renders are the same but for rounding.
+    The renderer skips contributions below `alpha_min`, so that renders stay the same but for
+    rounding. A training leaves such Gaussians behind where they fade after its last removal.
     """
     from xrgs.splat.gaussians import Gaussians
 
@@ -173,16 +170,6 @@ def _cell(folder: Path) -> CellFolder | None:
     if state.name != "done":
         raise XrgsError(f"{folder}: this cell is {state.name}, not done ({state.reason})")
     return cell
-
-
-def _load(folder: Path, cell: CellFolder | None) -> tuple[Variant, Dataset]:
-    from xrgs.mixture import variant
-    from xrgs.training import dataset
-
-    if cell is not None:
-        return cell.variant(), cell.dataset()
-    frozen = variant.load(folder)
-    return frozen, dataset.load(frozen)
 
 
 def _views(data: Dataset) -> Iterator[tuple[str, str, LoadedView]]:
@@ -236,7 +223,7 @@ def _write_nerfstudio(data: Dataset, images: list[PinholeImage], target: Path) -
     from xrgs.mixture import colmap
 
     colmap.write_points(target / "points.ply", *_points(data))
-    files = {"train": [], "test": []}  # type: dict[str, list[str]]
+    files: dict[str, list[str]] = {"train": [], "test": []}
     for name, split, _ in _views(data):
         files[split].append(f"images/{name}")
     content = {

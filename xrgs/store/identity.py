@@ -63,10 +63,6 @@ _STARTS = {"dense": ("training/dense",)}
 def cell_identity(conf: Conf, variant_id: str) -> Identity:
     """Return everything that decides a cell's trained numbers; its digest is the cell's id.
 
-    Args:
-        conf: The cell's config.
-        variant_id: The id of the frozen variant that the cell trains on.
-
     Raises:
         XrgsError: The configured backend is not available on this machine, or can't render with
             these settings, or a plugin is missing.
@@ -105,12 +101,8 @@ def code_now(
 ) -> dict[str, str]:
     """Return the digest of each part of the code that trains a cell, of the files as they are now.
 
-    Args:
-        backend: `native`, `torch` or `gsplat`.
-        components: Keys of the components that are on.
-        plugin_names: Names of components of other packages, sorted.
-        init: `splat.init` of the config.
-        strategy: `splat.strategy` of the config.
+    The components are the keys of those that are on, and the plugins the sorted names of those of
+    other packages.
 
     Raises:
         XrgsError: A plugin is not installed, or has no source file.
@@ -142,13 +134,8 @@ def _files(
 def changed_code(identity: Identity, *, cached: bool = False) -> list[str]:
     """Return the parts of the code that have changed since an identity was made, sorted.
 
-    Args:
-        identity: The identity of a cell.
-        cached: Take the digests that this process has computed before. Otherwise every file is read
-            as it is now: it may have been edited while a sweep runs.
-
-    Raises:
-        XrgsError: A plugin is not installed.
+    With `cached`, digests are those that this process has computed before. Otherwise every file is
+    read as it is now: it may have been edited while a sweep runs.
     """
     now = current_code(identity, cached=cached)
     trained = {part: canonical(part, code) for part, code in identity.code.items()}

@@ -5,7 +5,6 @@ Nothing here imports torch.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -112,26 +111,17 @@ class SfmReport(Struct):
         return tuple(note for note in self.notes if not note.startswith(left_out))
 
     @property
-    def not_trained(self) -> tuple[str, ...]:
-        """Names of the training views that are not placed."""
-        training = {*self.hr, *self.lr}
-        return tuple(name for name in self.not_registered if name in training)
-
-    @property
     def not_scored(self) -> tuple[str, ...]:
         """Names of the views that would be scored and are not placed."""
         training = {*self.hr, *self.lr} if self.tests else ()
         return tuple(name for name in self.not_registered if name not in training)
 
     def all_notes(self, most: int = 6) -> tuple[str, ...]:
-        """Return the notes, and sentences on the views that are not placed.
-
-        Args:
-            most: The most names in such a sentence.
-        """
+        """Return the notes, and sentences of at most some names on views that are not placed."""
         if not (self.hr or self.lr):  # a scene that failed, whose reason names the views
             return self.own_notes
-        lost = (("trained on", self.not_trained), ("scored", self.not_scored))
+        not_trained = [name for name in self.not_registered if name in {*self.hr, *self.lr}]
+        lost = (("trained on", not_trained), ("scored", self.not_scored))
         unplaced = [
             f"not placed, and so not {use}: {listed(names, most)}" for use, names in lost if names
         ]
@@ -139,11 +129,7 @@ class SfmReport(Struct):
 
 
 def read_report(folder: Path) -> SfmReport:
-    """Read how a variant was made, from its folder; it may be trimmed, or of a scene that failed.
-
-    Raises:
-        StoreError: The report or the list of views is missing or damaged, or can't be read now.
-    """
+    """Read how a variant was made, from its folder: a whole, a trimmed or a failed one."""
     report = read_struct(folder / REPORT, SfmReport)
     if is_failed(folder.name):
         return report
@@ -183,9 +169,6 @@ def describe(folder: Path, out: Path | None = None) -> str:
         folder: The variant's folder in a store, or the `failed-...` folder of one that failed.
         out: The PNG of the contact sheet; None writes `<variant id>.png` to the current folder.
 
-    Returns:
-        Tables and lines for a terminal. They name each image that can't be read.
-
     Raises:
         XrgsError: The folder is not a variant, or is damaged, or the sheet can't be written.
     """
@@ -214,10 +197,7 @@ def describe(folder: Path, out: Path | None = None) -> str:
 
 
 def views_table(frozen: Variant, report: SfmReport) -> TextTable:
-    """Return a table of the photographs that are trained on or held out, by name.
-
-    Photographs that SfM did not register are in the table too, by the names in the report.
-    """
+    """Return a table of the photographs that are trained on or held out, or are not placed."""
     rows = [
         (v.name, v.split, v.tag, f"{v.width} x {v.height}", f"{v.sampling_rate:.3f}", "yes")
         for v in frozen.views
@@ -229,15 +209,10 @@ def views_table(frozen: Variant, report: SfmReport) -> TextTable:
     columns = ("View", "Split", "Tag", "Size, px", "rho", "Placed")
     title = f"{frozen.scene}, variant {frozen.id}, factor {frozen.factor}"
     notes = tuple(_counts(frozen, tagless=report.tagless))
-    table = TextTable(title, columns, tuple(sorted(rows)), "lllrrl", notes)
-    return _without_column(table, "Tag") if report.tagless else table
-
-
-def _without_column(table: TextTable, name: str) -> TextTable:
-    at = table.columns.index(name)
-    columns, *rows = (row[:at] + row[at + 1 :] for row in (table.columns, *table.rows))
-    align = table.align[:at] + table.align[at + 1 :]
-    return replace(table, columns=columns, rows=tuple(rows), align=align)
+    kept = [name for name in range(len(columns)) if not (report.tagless and columns[name] == "Tag")]
+    columns, *rows = (tuple(row[i] for i in kept) for row in (columns, *sorted(rows)))
+    align = "".join("lllrrl"[i] for i in kept)
+    return TextTable(title, columns, tuple(rows), align, notes)
 
 
 def _counts(frozen: Variant, *, tagless: bool) -> Iterator[str]:

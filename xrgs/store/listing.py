@@ -62,7 +62,7 @@ class CellRow:
 
     @property
     def label(self) -> str:
-        """The label in the latest sweep; `?` without a sweep."""
+        """The label in the latest sweep, or `?`."""
         return self.recorded.label if self.recorded else "?"
 
     @property
@@ -105,12 +105,8 @@ class CellRow:
     @cached_property
     def age_s(self) -> float | None:
         """Seconds since the cell ended, or since its folder changed; None if unknown."""
-        for file in (self.folder.status_file, self.folder.path):
-            try:
-                return max(0.0, time.time() - file.stat().st_mtime)
-            except OSError:
-                continue
-        return None
+        when = modified(self.folder.status_file) or modified(self.folder.path)
+        return when and max(0.0, time.time() - when)
 
     @cached_property
     def bytes(self) -> int | None:
@@ -129,16 +125,9 @@ def cell_rows(
     records: Mapping[str, SweepRecord],
     holders: Mapping[str, str],
     *,
-    verify: bool = False,
+    verify: bool,
 ) -> list[CellRow]:
-    """List cells by scene, label, condition, seed and id.
-
-    Args:
-        cells: The cells' folders.
-        records: The records of sweeps, by the sweep's id, the latest last.
-        holders: Descriptions of the processes that train cells now, by the cells' ids.
-        verify: Hash the files that reports are made from; otherwise only sizes are compared.
-    """
+    """List cells as `Store.cell_rows`; `holders` describes the processes that train cells now."""
     recorded = latest_records(records)
     sweeps: dict[str | None, dict[str, None]] = {}
     for sweep_id, record in records.items():
@@ -146,9 +135,7 @@ def cell_rows(
             sweeps.setdefault(cell_id, {})[sweep_id] = None
     rows = []
     for cell in cells:
-        state = cell.state(verify=verify)
-        if state.name != "done" and cell.id in holders:
-            state = cell.running(holders[cell.id])
+        state = cell.state(verify=verify, owner=holders.get(cell.id))
         sweep_ids = tuple(sweeps.get(cell.id, ()))
         rows.append(CellRow(cell, state, recorded.get(cell.id), sweep_ids, _identity(cell)))
     return sorted(rows, key=lambda row: (row.scene, row.arm, row.seed or 0, row.id))
@@ -174,34 +161,27 @@ class SweepRow:
 
 
 def sweep_rows(
-    files: Mapping[str, Path],
-    records: Mapping[str, SweepRecord],
-    cells: Mapping[str, CellRow],
+    folder: Path, records: Mapping[str, SweepRecord], cells: Iterable[CellRow]
 ) -> list[SweepRow]:
-    """List recorded sweeps, the latest last.
-
-    Args:
-        files: The file of each record, by the sweep's id.
-        records: The records, the latest last.
-        cells: The cells of the store by their ids.
-    """
+    """List recorded sweeps, the latest last, whose records are in a folder."""
+    states = {cell.id: cell.state.name for cell in cells}
 
     def state(row: RecordedCell) -> str:
         if row.error:
             return "failed"
-        cell = cells.get(row.cell_id or "")
-        pending = cell is None or cell.state.name in {"absent", "planned", "unfinished"}
-        return "pending" if cell is None or pending else cell.state.name
+        name = states.get(row.cell_id or "", "absent")
+        return "pending" if name in {"absent", "planned", "unfinished"} else name
 
     return [
-        SweepRow(name, record, _modified(files[name]), Counter(map(state, record.cells)))
-        for name, record in records.items()
+        SweepRow(i, record, modified(folder / f"{i}.json"), Counter(map(state, record.cells)))
+        for i, record in records.items()
     ]
 
 
-def _modified(file: Path) -> float | None:
+def modified(file: Path) -> float | None:
+    """Return when a file was changed, in seconds since the epoch; None where it can't be read."""
     try:
-        return file.stat().st_mtime
+        return file.stat().st_mtime_ns / 1e9
     except OSError:
         return None
 
@@ -232,7 +212,11 @@ class Selection:
             XrgsError: No cell has a name that is given, or several ids have one beginning.
         """
         ids = [cell.id for cell in cells]
-        named = {full_id(word, ids, done=_done_cells(word, cells)) for word in self.ids}
+        done = [cell for cell in cells if cell.state.name == "done"]
+        named = {
+            full_id(word, ids, done={cell.id: cell.arm for cell in done if cell.scene == word})
+            for word in self.ids
+        }
         self._check("scenes", self.scenes, [cell.scene for cell in cells])
         self._check("ablations", self.ablations, [cell.label for cell in cells])
         self._check("states", self.states, STATES)
@@ -257,11 +241,6 @@ class Selection:
                 raise XrgsError(f"{key}={name}: no cell has that; choose from: {choices}")
 
 
-def _done_cells(scene: str, cells: Iterable[CellRow]) -> dict[str, str]:
-    """Return the labels of the done cells of a scene, by their ids."""
-    return {c.id: c.arm for c in cells if c.scene == scene and c.state.name == "done"}
-
-
 def size_of(path: Path) -> int | None:
     """Return the bytes of a file, or of all files of a folder; None where it can't be read."""
     try:
@@ -276,13 +255,10 @@ def full_id(
     kinds: str = "cells",
     done: Mapping[str, str] = MappingProxyType({}),
 ) -> str:
-    """Return the id that a word names.
+    """Return the id that a word names: an id, a beginning that no other id has, or a scene.
 
-    Args:
-        word: An id, a beginning that no other id has, or the name of a scene with one done cell.
-        ids: The ids to choose from.
-        kinds: The things with these ids, for messages.
-        done: The labels of the done cells of the scene with that name, by the cells' ids.
+    A scene must have one cell in `done`, which has the labels of its done cells by their ids.
+    Messages call the things with these ids `kinds`.
 
     Raises:
         StoreError: The word names none, or several.

@@ -54,28 +54,23 @@ def _instruction_set(backend: str) -> str | None:
     return str(_native.isa())
 
 
-def _gpu(backend: str) -> str | None:
-    """Return the name of the GPU that trains; None where the backend uses none."""
-    if device(backend) != "cuda":
-        return None
-    import torch
-
-    return torch.cuda.get_device_name()
-
-
 def collect(threads: int, backend: str) -> Provenance:
     """Return the program, its libraries, the machine and the time.
 
     Args:
         threads: The threads that the cell uses.
-        backend: The rasterizer in use: `native`, `torch` or `gsplat`.
+        backend: `native`, `torch` or `gsplat`.
 
     Raises:
         WeightsError: The weights of LPIPS on this machine are not the published ones. A cell that
             can't be scored is better stopped here than after its training.
         XrgsError: The backend is not available on this machine.
     """
-    built_from = _commit()
+    built_from, gpu = _commit(), None
+    if device(backend) == "cuda":
+        import torch
+
+        gpu = torch.cuda.get_device_name()
     published = weights.load_published()
     return Provenance(
         xrgs=xrgs.__version__,
@@ -91,7 +86,7 @@ def collect(threads: int, backend: str) -> Provenance:
         lpips_weights_sha256=None if published is None else weights.CONTENT_SHA256,
         started=datetime.now(UTC).isoformat(timespec="seconds"),
         cpu=_cpu(),
-        gpu=_gpu(backend),
+        gpu=gpu,
         instruction_set=_instruction_set(backend),
     )
 
@@ -117,11 +112,7 @@ def processor(made: Provenance) -> str:
 
 @cache
 def this_processor(backend: str) -> str:
-    """Return the processor of this machine, named as by `processor`.
-
-    Args:
-        backend: The rasterizer in use: `native`, `torch` or `gsplat`.
-    """
+    """Return the processor of this machine, named as by `processor`."""
     return _processor(_cpu(), _instruction_set(backend))
 
 
@@ -141,12 +132,7 @@ class Machines:
         return {"names": self.names}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Put the machines of a checkpoint, which trained before, in front of this one.
-
-        Raises:
-            KeyError: The state has no names.
-            TypeError: A name is not a text.
-        """
+        """Put the machines of a checkpoint, which trained before, in front of this one."""
         before = state["names"]
         if not isinstance(before, list) or not all(isinstance(name, str) for name in before):
             raise TypeError(f"names: {before!r:.40} must be a list of texts")

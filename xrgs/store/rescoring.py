@@ -50,14 +50,10 @@ def rescore(store: Store, cells: Sequence[CellFolder], also: Sequence[str] = ())
     the renders are replaced. A cell that is being trained, is not done, has no Gaussians any more,
     or was trained with another rasterizer is left as it is.
 
-    Args:
-        store: The store.
-        cells: The cells.
-        also: Scores of `xrgs.evaluation.metrics.ON_REQUEST` to add. A cell that has one keeps it.
+    Scores of `ON_REQUEST` that are named in `also` are added. A cell that has one keeps it.
 
     Raises:
-        StoreError: The store can't be written.
-        XrgsError: A score is none of `ON_REQUEST`.
+        XrgsError: The store can't be written, or a score is none of `ON_REQUEST`.
     """
     if unknown := sorted(set(also) - ON_REQUEST):
         raise XrgsError(f"also={unknown[0]}: choose from: {', '.join(sorted(ON_REQUEST))}")
@@ -65,11 +61,16 @@ def rescore(store: Store, cells: Sequence[CellFolder], also: Sequence[str] = ())
     scored, left, current = [], [], 0
     for cell in progress(cells, "scoring", "cell", len(cells)):
         try:
-            if stale_scores(_done(cell), added):
-                _score_under_lease(store, cell, added)
-                scored.append(cell.id)
-            else:
+            if not stale_scores(_done(cell), added):
                 current += 1
+                continue
+            if (held := lease.acquire(store.leases, cell.id)) is None:
+                raise StoreError("a sweep is training it")
+            try:
+                _score(cell, added)
+            finally:
+                held.release()
+            scored.append(cell.id)
         except XrgsError as error:
             left.append(f"{cell.id}: {error}")
         except OSError as error:
@@ -78,27 +79,13 @@ def rescore(store: Store, cells: Sequence[CellFolder], also: Sequence[str] = ())
 
 
 def _done(cell: CellFolder) -> dict[str, str]:
-    """Return the digests of the code that has scored a done cell.
-
-    Raises:
-        StoreError: The cell is not done, or its status is damaged.
-    """
+    """Return the digests of the code that has scored a done cell."""
     if not cell.status_file.exists():
         raise StoreError("it is not done")
     status = cell.status()
     if status.state != "done":
         raise StoreError(f"it failed: {status.reason}")
     return status.scored_by
-
-
-def _score_under_lease(store: Store, cell: CellFolder, also: frozenset[str]) -> None:
-    cell_lease = lease.acquire(store.leases, cell.id)
-    if cell_lease is None:
-        raise StoreError("a sweep is training it")
-    try:
-        _score(cell, also)
-    finally:
-        cell_lease.release()
 
 
 def _score(cell: CellFolder, also: frozenset[str]) -> None:

@@ -46,17 +46,12 @@ def restore_images(
 ) -> None:
     """Make the images of a variant, and compare them with the hashes in its list of files.
 
-    Args:
-        folder: The variant's folder, which has all of its files but the images.
-        scene: The config of its scene.
-        conf: The config that it was built with.
-        work: An existing folder for temporary files.
-        cache: The store's folder of rendered scenes.
+    The configs are those that it was built with, `work` is a folder for temporary files, and
+    `cache` the store's folder of rendered scenes.
 
     Raises:
-        StoreError: A file of the folder is damaged or names no photograph, or an image differs
-            from the removed one; the message names it.
-        XrgsError: The photographs can't be read.
+        XrgsError: The photographs can't be read, a file of the folder is damaged or names no
+            photograph, or an image differs from the removed one; the message names it.
     """
     manifest = saved_variant.read_manifest(folder)
     cameras = read_struct(folder / saved_variant.REPORT, _Report).lenses

@@ -27,14 +27,7 @@ _CONFIG_GROUPS = ("scene", "variant", "splat", "train", "components")
 
 
 def cells_table(rows: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
-    """Make the table of `Store.cells`.
-
-    Args:
-        rows: One mapping a cell: the values of `cell_columns`, with `state` and `reason`.
-
-    Returns:
-        The cells sorted by scene, label, condition, seed and id, with the config's columns last.
-    """
+    """Make the table of `Store.cells` of the values of `cell_columns`, `state` and `reason`."""
     rows = list(rows)
     metrics = [metric.name for metric in METRICS]
     leading = ["cell_id", *CELL_NAMES, "seed", "variant", "state", "reason", *metrics]
@@ -48,10 +41,8 @@ def cells_table(rows: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
 def cell_columns(cell: CellFolder, names: RecordedCell | None) -> dict[str, Any]:
     """Return a cell's names, seed, variant and settings, as columns of a table.
 
-    Args:
-        cell: The cell, whose `identity.json` and `config.json` are read. Where one is missing or
-            damaged, its columns are missing or None.
-        names: The cell's row in the record of a sweep; None where there is none.
+    Columns of a file that is missing or damaged are missing or None. `names` is the cell's row in
+    the record of a sweep.
     """
     identity = None
     with suppress(StoreError):
@@ -106,14 +97,9 @@ def over_views(views: pd.DataFrame) -> pd.DataFrame:
 
 
 def cell_metrics(summary: Summary, scores: pd.DataFrame) -> dict[str, float]:
-    """Return the metrics of a finished cell, by name.
+    """Return the metrics of a finished cell by name: its figures, and `over_views` of its scores.
 
-    Args:
-        summary: The figures of the whole cell.
-        scores: The scores of its views, as `CellFolder.scores` returns them.
-
-    Returns:
-        Figures of the whole cell, and `over_views` of its scores.
+    `scores` are as `CellFolder.scores` returns them.
     """
     means = over_views(scores.assign(cell_id="")).iloc[0]
     figures = msgspec.structs.asdict(summary)

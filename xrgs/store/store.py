@@ -29,6 +29,7 @@ from xrgs.safeio.records import list_folder, read_struct
 from xrgs.safeio.sanitize import for_line
 from xrgs.store import listing
 from xrgs.store.cell_folder import IDENTITY, CellFolder, CellState
+from xrgs.store.listing import modified
 from xrgs.store.schema import SweepRecord
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ BASELINE = "baseline"
 DEFAULT_STORE = Path("xrgs-store")
 
 #: The largest record of a sweep that is read, in bytes: 100,000 cells take 30 MB.
-MAX_RECORD_BYTES = 1 << 25
+_MAX_RECORD_BYTES = 1 << 25
 #: Bytes that must be writable before a sweep starts; any cell needs more than that.
 _MIN_FREE_BYTES = 1 << 15
 
@@ -106,10 +107,10 @@ class Store:
 
     @property
     def exists(self) -> bool:
-        """Whether the folder is a store: whether it is there and has a folder of cells.
+        """Whether the folder is there and has a folder of cells.
 
         Raises:
-            StoreError: The folder can't be read now; the message names it.
+            UnreadableError: The folder can't be read now.
         """
         try:
             return stat.S_ISDIR(self.cells_folder.stat().st_mode)
@@ -119,11 +120,7 @@ class Store:
             return False
 
     def check_exists(self) -> None:
-        """Refuse a folder that is not a store.
-
-        Raises:
-            StoreError: It is none, or can't be read now.
-        """
+        """Raise `StoreError` where the folder is no store, or can't be read now."""
         if not self.exists:
             raise StoreError(f"store={self.path} is not a store; xrgs-sweep makes one")
 
@@ -139,11 +136,7 @@ class Store:
             return False
 
     def check_not_gone(self) -> None:
-        """Refuse to go on with a store that is gone: nothing may be created in its place.
-
-        Raises:
-            StoreGoneError: The message says what has become of the cells.
-        """
+        """Raise `StoreGoneError` where the store is gone: nothing may be created in its place."""
         if self.is_gone:
             raise StoreGoneError(
                 f"store={self.path}: it is no longer there (moved or deleted?); finished cells are"
@@ -166,15 +159,7 @@ class Store:
         self.check_room()
 
     def check_room(self) -> None:
-        """Check that the disk has room, without creating the folder.
-
-        Raises:
-            StoreError: As `prepare`.
-        """
-        self._write_nameless(self.path)
-
-    def check_writable(self) -> None:
-        """Check that `prepare` could write, and leave nothing behind.
+        """Check that the disk has room, and leave nothing behind; the folder need not exist yet.
 
         Raises:
             StoreError: As `prepare`.
@@ -182,10 +167,6 @@ class Store:
         folder = self.path.absolute()
         while not folder.exists() and not folder.is_symlink():
             folder = folder.parent
-        self._write_nameless(folder)
-
-    def _write_nameless(self, folder: Path) -> None:
-        """Write a nameless file into a folder; it is gone when it is closed."""
         try:
             with tempfile.TemporaryFile(dir=folder) as file:
                 file.write(bytes(_MIN_FREE_BYTES))
@@ -213,14 +194,7 @@ class Store:
         return CellFolder(self.cells_folder / cell_id)
 
     def variant(self, variant_id: str) -> Path:
-        """Return the folder of a variant, which need not exist.
-
-        Args:
-            variant_id: The variant's id.
-
-        Raises:
-            StoreError: The id is not a valid name of a folder.
-        """
+        """Return the folder of a variant, which need not exist; see `cell`."""
         if not is_name(variant_id):
             raise StoreError(f"{variant_id!r:.80} is not the id of a variant")
         return self.variants / variant_id
@@ -264,15 +238,9 @@ class Store:
     def cell_rows(
         self, records: Mapping[str, SweepRecord] | None = None, *, verify: bool = False
     ) -> list[CellRow]:
-        """List the cells: id, names, state, age and size, see `xrgs.store.listing`.
+        """List the cells by scene, label, condition, seed and id, see `cells`.
 
-        Args:
-            records: The records of sweeps, as `records` returns them; None to read them, where one
-                that can't be read is named on stderr.
-            verify: As for `cells`.
-
-        Raises:
-            StoreError: There is no store, or its cells can't be listed.
+        The records of sweeps are read where they are not given.
         """
         self.check_exists()
         records = self._records_or_warnings() if records is None else records
@@ -280,28 +248,21 @@ class Store:
         return listing.cell_rows(self.cell_folders(), records, holders, verify=verify)
 
     def sweep_rows(self) -> list[SweepRow]:
-        """List the recorded sweeps, the latest last.
-
-        A record that can't be read is named on stderr, and left out.
-
-        Raises:
-            StoreError: There is no store, or it can't be listed.
-        """
+        """List the recorded sweeps, the latest last; raises as `cell_rows`."""
         records = self._records_or_warnings()
-        cells = {row.id: row for row in self.cell_rows(records)}
-        files = {sweep_id: self.sweeps / f"{sweep_id}.json" for sweep_id in records}
-        return listing.sweep_rows(files, records, cells)
+        return listing.sweep_rows(self.sweeps, records, self.cell_rows(records))
 
     def cell_names(self) -> dict[str, RecordedCell]:
         """Return the row of the latest sweep that has each recorded cell, by the cell's id."""
         return listing.latest_records(self._records_or_warnings())
 
-    def sweeps_of(self, cell_id: str) -> list[str]:
-        """Return the ids of the recorded sweeps that have a cell, the latest last."""
+    def sweeps_of(self, *cell_ids: str) -> list[str]:
+        """Return the ids of the recorded sweeps that have one of some cells, the latest last."""
         records = self._records_or_warnings()
-        return [i for i, r in records.items() if any(row.cell_id == cell_id for row in r.cells)]
+        return [i for i, r in records.items() if any(row.cell_id in cell_ids for row in r.cells)]
 
     def _records_or_warnings(self) -> dict[str, SweepRecord]:
+        """Return the records that can be read; the others are named on stderr."""
         try:
             records, damaged = self.records()
         except StoreError as error:
@@ -326,14 +287,7 @@ class Store:
         return self.cell(self._full_id(word, [cell.id for cell in self.cell_folders()], "cells"))
 
     def find_folder(self, word: str) -> Path:
-        """Return the folder of the cell or the variant that a word names.
-
-        Args:
-            word: As for `find_cell`, or the same for a variant.
-
-        Raises:
-            StoreError: There is no store, the word names no cell or variant, or it names several.
-        """
+        """Return the folder of the cell or the variant that a word names, see `find_cell`."""
         if any((user_path(word) / name).is_file() for name in (IDENTITY, MANIFEST)):
             return user_path(word)
         self.check_exists()
@@ -343,14 +297,9 @@ class Store:
         return folders[self._full_id(word, list(folders), "cells or variants")]
 
     def find_sweep(self, word: str) -> str:
-        """Return the id of the sweep that a word names; a scene names its latest sweep.
+        """Return the id of the sweep that a word names, see `find_cell`.
 
-        Args:
-            word: The sweep's id, or a beginning that no other id has; or the name of a scene, or
-                the path of its folder.
-
-        Raises:
-            StoreError: There is no store, or the word names no sweep, or several.
+        A scene names its latest sweep.
         """
         self.check_exists()
         records, name = self._records_or_warnings(), _name_of(word)
@@ -374,7 +323,7 @@ class Store:
         A link or a file with the name of a cell is among them; its state says that it is corrupt.
 
         Raises:
-            StoreError: The folder of cells can't be listed; the message names it.
+            StoreError: The folder of cells can't be listed.
         """
         names = list_folder(self.cells_folder)
         return [self.cell(name) for name in names if "." not in name and is_name(name)]
@@ -383,22 +332,16 @@ class Store:
         """Return the ids of the recorded sweeps, oldest first.
 
         Raises:
-            StoreError: The folder of the records can't be listed; the message names it.
+            StoreError: The folder of the records can't be listed.
         """
         names = [name for name in list_folder(self.sweeps) if name.endswith(".json")]
         files = [self.sweeps / name for name in names if is_name(name)]
-        times = {file.stem: _modified_ns(file) for file in files}
-        return sorted(times, key=lambda sweep_id: (times[sweep_id], sweep_id))
+        return [file.stem for file in sorted(files, key=lambda file: (modified(file) or 0, file))]
 
     def records(self) -> tuple[dict[str, SweepRecord], tuple[str, ...]]:
-        """Read the records of all sweeps.
+        """Read the records of all sweeps, oldest first, by their ids; raises as `sweep_ids`.
 
-        Returns:
-            The records that can be read, by the sweep's id, oldest first, and for each other one a
-            message that names its file.
-
-        Raises:
-            StoreError: As `sweep_ids`.
+        For each one that can't be read there is a message that names its file.
         """
         records, damaged = {}, []
         for sweep_id in self.sweep_ids():
@@ -413,15 +356,8 @@ class Store:
     ) -> str:
         """Record which cells a sweep compares, for its report: when it starts, and at its end.
 
-        Args:
-            command: Arguments of `xrgs-sweep`.
-            cells: The cells.
-            sweep_id: The id that the sweep has already, whose record is replaced; None when it
-                starts.
-
-        Returns:
-            The id of the record. Sweeps that ask for the same cells have the same id, however many
-            of the cells are done.
+        The id of the record is returned, and given again at the end. Sweeps that ask for the same
+        cells have the same id, however many of the cells are done.
         """
         rows = msgspec.to_builtins(tuple(cells))
         record = SweepRecord(1, tuple(command), tuple(cells), digest(rows))
@@ -462,18 +398,19 @@ class Store:
         sweep_id = sweep_id or self.latest_sweep()
         if not is_name(sweep_id):
             raise StoreError(f"{sweep_id!r:.80} is not the id of a sweep")
-        return read_struct(self.sweeps / f"{sweep_id}.json", SweepRecord, MAX_RECORD_BYTES)
+        return read_struct(self.sweeps / f"{sweep_id}.json", SweepRecord, _MAX_RECORD_BYTES)
 
-    def verify_sweep(self, sweep_id: str) -> None:
-        """Check that a sweep's record is the one that was written, by the hash in it.
 
-        Raises:
-            StoreError: The record can't be read, or has changed; the message names the file.
-        """
-        record = self.sweep_record(sweep_id)
-        if digest(msgspec.to_builtins(record.cells)) != record.digest:
-            file = self.sweeps / f"{sweep_id}.json"
-            raise StoreError(f"{file}: its cells have changed since it was written")
+def unchanged_record(file: Path) -> SweepRecord:
+    """Read the record of a sweep, and check by the hash in it that it is the one that was written.
+
+    Raises:
+        StoreError: The record can't be read, or has changed; the message names the file.
+    """
+    record = read_struct(file, SweepRecord, _MAX_RECORD_BYTES)
+    if digest(msgspec.to_builtins(record.cells)) != record.digest:
+        raise StoreError(f"{file}: its cells have changed since it was written")
+    return record
 
 
 def _name_of(word: str) -> str:
@@ -485,11 +422,3 @@ def _asked_for(row: dict[str, Any]) -> dict[str, Any]:
     """Return the part of a record's row that is known before any cell is trained."""
     names = ("scene", "label", "condition", "variant_seed", "seed", "variant_id", "planned_id")
     return {name: row[name] for name in names}
-
-
-def _modified_ns(file: Path) -> int:
-    """Return when a file was changed; 0 where its status can't be read."""
-    try:
-        return file.stat().st_mtime_ns
-    except OSError:
-        return 0

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from xrgs.errors import StoreError, UnreadableError
+from xrgs.errors import StoreError
 from xrgs.mixture.paths import trimmed_folder
 from xrgs.photos import images
 from xrgs.photos.images import ImageError
@@ -51,27 +51,21 @@ def texture(image: NDArray[np.float32], mask: NDArray[np.bool_] | None = None) -
 
 
 def texture_of(variant: Path, view: str) -> float:
-    """Return the texture of a photograph; NaN where it can't be read, and none was kept.
+    """Return the texture of a photograph, as `test/a`; NaN where none can be read or was kept.
 
-    Args:
-        variant: The folder that the variant has where it is not trimmed.
-        view: Split and name of the view: `test/a`.
+    The folder is the one that the variant has where it is not trimmed.
     """
     trimmed = trimmed_folder(variant.parent, variant.name)
     if not trimmed.is_dir():
         return _measured(variant, view)
     try:
-        return read_struct(trimmed / FILE, dict[str, float]).get(view, math.nan)
-    except (StoreError, UnreadableError):
+        return textures(trimmed).get(view, math.nan)
+    except StoreError:
         return math.nan
 
 
 def textures(folder: Path) -> dict[str, float]:
-    """Return the textures of a variant's views; of a trimmed one those that were kept.
-
-    Args:
-        folder: The variant's folder. Photographs that can't be read are left out.
-    """
+    """Return the textures of a variant's views that can be read; of a trimmed one those kept."""
     if (folder / FILE).exists():
         return read_struct(folder / FILE, dict[str, float])
     views = sorted(
@@ -91,5 +85,5 @@ def _measured(folder: Path, view: str) -> float:
         image = images.read_png(folder / "images" / f"{view}.png")
         size = image.shape[1], image.shape[0]
         return texture(image, images.read_mask(mask, size) if mask.exists() else None)
-    except (ImageError, StoreError, UnreadableError):
+    except (ImageError, StoreError):
         return math.nan

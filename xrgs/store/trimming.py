@@ -30,19 +30,14 @@ _IMAGES = "images"
 
 
 def trimmed_variant(variants: Path, key: str) -> str | None:
-    """Return the id of the trimmed variant with a key (`xrgs.mixture.variant.key`), or None.
-
-    Raises:
-        StoreError: The folder of variants can't be listed.
-    """
+    """Return the id of the trimmed variant with a key (`xrgs.mixture.variant.key`), or None."""
     ids = map(id_of, filter(is_trimmed, list_folder(variants)))
     return next((variant_id for variant_id in ids if variant_id.startswith(f"{key}-")), None)
 
 
 def check_images(variants: Path, variant_id: str) -> None:
     """Raise `StoreError` where a variant is trimmed; the message says what makes its images."""
-    folder = trimmed_folder(variants, variant_id)
-    if folder.is_dir():
+    if trimmed_folder(variants, variant_id).is_dir():
         raise StoreError(
             f"variant {variant_id}: its images were removed by xrgs-store trim; xrgs-sweep makes"
             " them again when it trains a cell on this variant"
@@ -52,11 +47,7 @@ def check_images(variants: Path, variant_id: str) -> None:
 def trim_variant(variants: Path, variant_id: str) -> None:
     """Remove the images of a variant, and mark it as trimmed by the name of its folder.
 
-    The texture of each view is kept. Trimming a trimmed variant completes a removal that was
-    stopped, and else changes nothing.
-
-    Raises:
-        OSError: The folder can't be renamed, or the images can't be removed.
+    Trimming a trimmed variant completes a removal that was stopped, and else changes nothing.
     """
     folder, trimmed = variants / variant_id, trimmed_folder(variants, variant_id)
     if folder.is_dir():
@@ -68,27 +59,15 @@ def trim_variant(variants: Path, variant_id: str) -> None:
 
 
 def restore_variant(
-    variants: Path,
-    variant_id: str,
-    scene: SceneConf,
-    conf: VariantConf,
-    cache: Path,
+    variants: Path, variant_id: str, scene: SceneConf, conf: VariantConf, cache: Path
 ) -> None:
     """Make the images of a trimmed variant again; any number of processes may call this at once.
 
-    Nothing happens to a variant that has its images.
-
-    Args:
-        variants: The store's folder of variants.
-        variant_id: The variant's id.
-        scene: The config of the variant's scene.
-        conf: The config that the variant was built with.
-        cache: The store's folder of rendered scenes.
+    Nothing happens to a variant that has its images. Arguments as for `restore_images`.
 
     Raises:
         UnreadableError: A photograph can't be read now.
         StoreError: The images can't be made again; the message says why. The variant stays trimmed.
-        OSError: The store can't be written.
     """
     from xrgs.store.restore import restore_images
 

@@ -17,6 +17,7 @@ from xrgs.safeio.files import walk_files
 from xrgs.safeio.records import list_folder
 from xrgs.safeio.sanitize import for_line
 from xrgs.store import trimming
+from xrgs.store.store import unchanged_record
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -39,16 +40,6 @@ class Verification:
     begins with the path."""
 
 
-@dataclass(frozen=True)
-class _Part:
-    """A cell, a variant, a scene or a record, with its check."""
-
-    path: Path
-    files: int
-    bytes: int
-    verify: Callable[[], list[str]]
-
-
 def verify(store: Store) -> Verification:
     """Hash every file of the finished cells, the frozen variants, the scenes and the records.
 
@@ -59,13 +50,13 @@ def verify(store: Store) -> Verification:
     start = time.perf_counter()
     damage: list[str] = []
     parts = list(_parts(store, damage))
-    total = sum(part.bytes for part in parts)
+    total = sum(size for _, size, _ in parts)
     with ProgressBar("hashing", "byte", total) as bar:
-        for part in parts:
-            damage += part.verify()
-            bar.update(part.bytes)
+        for _, size, check in parts:
+            damage += check()
+            bar.update(size)
     seconds = time.perf_counter() - start
-    return Verification(sum(part.files for part in parts), total, seconds, tuple(damage))
+    return Verification(sum(files for files, *_ in parts), total, seconds, tuple(damage))
 
 
 def describe(verification: Verification) -> str:
@@ -78,8 +69,11 @@ def describe(verification: Verification) -> str:
     return "\n".join(map(for_line, lines))
 
 
-def _parts(store: Store, damage: list[str]) -> Iterator[_Part]:
-    """Yield the parts of a store; add a line to `damage` for each that can't be listed."""
+def _parts(store: Store, damage: list[str]) -> Iterator[tuple[int, int, Callable[[], list[str]]]]:
+    """Yield for each part of a store its number of regular files, their bytes and its check.
+
+    Add a line to `damage` for each part that can't be listed.
+    """
     for kind in (_cells, _variants, _scenes, _records):
         try:
             checks = list(kind(store))
@@ -88,11 +82,12 @@ def _parts(store: Store, damage: list[str]) -> Iterator[_Part]:
             continue
         for path, check in checks:
             try:
-                files, size = _extent(path)
+                statuses = [of for _, of in walk_files(path)] if path.is_dir() else [path.lstat()]
             except OSError as error:
                 damage.append(f"{error.filename}: {error.strerror}")
                 continue
-            yield _Part(path, files, size, check)
+            sizes = [of.st_size for of in statuses if stat.S_ISREG(of.st_mode)]
+            yield len(sizes), sum(sizes), check
 
 
 def _cells(store: Store) -> _Checks:
@@ -121,19 +116,13 @@ def _scenes(store: Store) -> _Checks:
 
 def _records(store: Store) -> _Checks:
     for sweep_id in store.sweep_ids():
-        yield store.sweeps / f"{sweep_id}.json", partial(_record, store, sweep_id)
+        file = store.sweeps / f"{sweep_id}.json"
+        yield file, partial(_record, file)
 
 
-def _record(store: Store, sweep_id: str) -> list[str]:
+def _record(file: Path) -> list[str]:
     try:
-        store.verify_sweep(sweep_id)
+        unchanged_record(file)
     except StoreError as error:
         return [str(error)]
     return []
-
-
-def _extent(path: Path) -> tuple[int, int]:
-    """Return the number of regular files at a path or below, and their bytes."""
-    statuses = [status for _, status in walk_files(path)] if path.is_dir() else [path.lstat()]
-    sizes = [status.st_size for status in statuses if stat.S_ISREG(status.st_mode)]
-    return len(sizes), sum(sizes)

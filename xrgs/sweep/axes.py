@@ -66,10 +66,7 @@ def effective(arguments: Sequence[str]) -> list[str]:
 def expand(arguments: Sequence[str], loader: ConfigLoader | None = None) -> list[CellSpec]:
     """Return every combination of the axes, each group with its matching baseline first.
 
-    Args:
-        arguments: Hydra overrides, for example `+ablation=consistency,loss_weighting` and
-            `seed=0,1`.
-        loader: Lists the files of a group, for `glob(...)`.
+    The arguments are as for `parsed`, for example `+ablation=consistency,loss_weighting seed=0,1`.
 
     Raises:
         XrgsError: An axis is an interval instead of a list of values, or has no value.

@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, TypeVar
 
 from xrgs.config import CONF_DIR
@@ -24,7 +25,6 @@ from xrgs.store import trimming
 from xrgs.store.inspect import read_report
 from xrgs.store.store import StoreGoneError
 from xrgs.sweep import job
-from xrgs.sweep.job import Limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -50,40 +50,35 @@ class PlannedVariant:
     """The notes of its report; in a dry run, the notes that a new variant's report would have."""
 
 
-def build(conf: Conf, store: Store) -> str:
+def build(
+    conf: Conf,
+    store: Store,
+    place: str = "",
+    is_over: Callable[[], bool] = lambda: False,
+    environment: Mapping[str, str] = MappingProxyType({}),
+) -> str:
     """Build the variant of a config in a child process, and return its id.
 
-    Args:
-        conf: A cell's config, of which only scene and variant are read.
-        store: The store to build it in.
+    A message tells the `place` among several builds. The child is ended when `is_over`, and has
+    the variables of `environment` besides those of this process.
 
     Raises:
         WorkError: The build failed, or the disk is full or can't be written.
-        UnreadableError: A file can't be read now.
-        StoreGoneError: The store is no longer there.
         XrgsError: The photographs are missing, or can't be made into a variant.
     """
-    return _build(conf, store, "", store.check_not_gone, {})
 
+    def on_poll(_: int) -> None:
+        store.check_not_gone()
+        if is_over():
+            raise job.WorkError("the sweep has ended", job.STOPPED)
 
-def _build(
-    conf: Conf,
-    store: Store,
-    place: str,
-    check: Callable[[], None],
-    environment: Mapping[str, str],
-) -> str:
-    """Build a variant, and say its place among several.
-
-    An exception that `check` raises meanwhile ends the child.
-    """
     _check_held_out(scenes.names(conf.scene, conf.variant.long_side), conf)  # SfM takes minutes
     work = "building the mixed-resolution variant"
     if resolve_degradation(conf.variant) == "none":
         work = "finding the cameras" if conf.variant.poses is None else "reading the cameras"
     log_line(f"{scenes.label(conf.scene)}: {work}{place}")
     request = {"conf": asdict(conf), "store": str(store.path)}
-    answer = job.run_in_child("variant", request, Limits(), lambda _: check(), environment)
+    answer = job.run_in_child("variant", request, None, on_poll, environment)
     return str(answer["variant"])
 
 
@@ -130,11 +125,7 @@ def _root_near(missing: Path) -> str:
 
 
 def find_or_build(conf: Conf, store: Store) -> str:
-    """Return the id of the frozen variant of a config, and build it if the store lacks it.
-
-    Raises:
-        XrgsError: The photographs are missing, or can't be made into a variant.
-    """
+    """Return the id of the frozen variant of a config; `build` it if the store lacks it."""
     if hint := how_to_get([conf.scene]):
         raise XrgsError(f"scene.path={conf.scene.path}: no such folder; {hint}")
     frozen = variant.find(store.variants, variant.key(conf.scene, conf.variant))
@@ -150,10 +141,7 @@ def plan(confs: Sequence[Conf], store: Store, *, allow_build: bool) -> list[Plan
     The variants that the store lacks are built, several at once. A scene that failed before is not
     tried again, like a failed cell, unless `retry=failed`.
 
-    Args:
-        confs: Configs of cells, one for each variant.
-        store: The store.
-        allow_build: Build the variants that the store lacks; False for a dry run.
+    In a dry run `allow_build` is False.
 
     Raises:
         StoreError: The store can't be written, or is no longer there.
@@ -163,7 +151,7 @@ def plan(confs: Sequence[Conf], store: Store, *, allow_build: bool) -> list[Plan
     if allow_build:
         new = _build_all(lacking, len(confs), store)
     else:  # not before a build, which leaves out files that have a header and can't be decoded
-        new = {i: _outcome(_unbuilt_variant, conf, store) for i, conf in lacking.items()}
+        new = {i: _outcome(_expected_variant, conf, store) for i, conf in lacking.items()}
     return [planned or new[i] for i, planned in enumerate(stored)]
 
 
@@ -180,20 +168,11 @@ def _stored_variant(conf: Conf, store: Store) -> PlannedVariant | None:
     return None if conf.retry == "failed" else _failed_before(store, key)
 
 
-def _unbuilt_variant(conf: Conf, store: Store) -> PlannedVariant:
-    """Return a variant that a dry run does not build, with the notes that it would have."""
-    return PlannedVariant(notes=_expected_notes(conf, store))
-
-
 def _build_all(lacking: Mapping[int, Conf], total: int, store: Store) -> dict[int, PlannedVariant]:
     """Build variants, several at once.
 
     COLMAP finds the cameras of a scene on one core: a single build would leave the others idle.
-
-    Args:
-        lacking: Configs by their place among all variants of the sweep.
-        total: Number of variants of the sweep.
-        store: The store.
+    The configs are by their places among all variants of the sweep.
     """
     cores = usable_cores()
     at_once = max(1, min(len(lacking), cores, usable_memory() // _BUILD_BYTES))
@@ -202,14 +181,9 @@ def _build_all(lacking: Mapping[int, Conf], total: int, store: Store) -> dict[in
         environment["TQDM_DISABLE"] = "1"  # the bars of several builds would overwrite each other
     ended = threading.Event()
 
-    def check() -> None:
-        store.check_not_gone()
-        if ended.is_set():
-            raise job.WorkError("the sweep has ended", job.STOPPED)
-
     def build_one(i: int, conf: Conf, store: Store) -> PlannedVariant:
         place = f" {i + 1} of {total}" if total > 1 else ""
-        built = _build(conf, store, place, check, environment)
+        built = build(conf, store, place, ended.is_set, environment)
         return PlannedVariant(built, notes=_notes(store.variants / built))
 
     with ThreadPoolExecutor(at_once) as pool:
@@ -218,22 +192,18 @@ def _build_all(lacking: Mapping[int, Conf], total: int, store: Store) -> dict[in
             for i, conf in lacking.items()
         }
         try:
-            for build in as_completed(builds.values()):
-                build.result()
+            for ending in as_completed(builds.values()):
+                ending.result()
         finally:  # an error or a signal ends the other builds
             ended.set()
             pool.shutdown(cancel_futures=True)
-    return {i: build.result() for i, build in builds.items()}
+    return {i: ending.result() for i, ending in builds.items()}
 
 
 def _outcome(
     work: Callable[[Conf, Store], _Result], conf: Conf, store: Store, *, building: bool = False
 ) -> _Result | PlannedVariant:
-    """Return what `work` returns for a config, or the reason why the scene has no variant.
-
-    Raises:
-        StoreError: The store can't be written, or is no longer there.
-    """
+    """Return what `work` returns for a config, or the reason why the scene has no variant."""
     try:
         return work(conf, store)
     except StoreGoneError:
@@ -274,21 +244,14 @@ def _with_notes(conf: Conf, store: Store, variant_id: str, folder: Path) -> Plan
 
     Files that have come into the scene's folder since, for example a store, have notes too.
     """
-    notes = _scene(conf, store).notes if conf.scene.kind == "folder" else ()
+    notes: tuple[str, ...] = ()
+    if conf.scene.kind == "folder":
+        notes = tuple(scenes.resolve(conf.scene, store.scenes, conf.variant.long_side).notes)
     return PlannedVariant(variant_id, notes=tuple(dict.fromkeys((*notes, *_notes(folder)))))
 
 
-def _scene(conf: Conf, store: Store) -> scenes.Scene:
-    """List the photographs of a folder."""
-    return scenes.resolve(conf.scene, store.scenes, conf.variant.long_side)
-
-
 def _notes(folder: Path) -> tuple[str, ...]:
-    """Return the notes on photographs in the report of a variant, or of a scene that failed.
-
-    Raises:
-        UnreadableError: The report can't be read now.
-    """
+    """Return the notes on photographs in the report of a variant, or of a scene that failed."""
     try:
         return read_report(folder).all_notes()
     except UnreadableError:
@@ -297,17 +260,18 @@ def _notes(folder: Path) -> tuple[str, ...]:
         return (str(error),)
 
 
-def _expected_notes(conf: Conf, store: Store) -> tuple[str, ...]:
-    """Return the notes that a variant would have, from the names and headers of photographs.
+def _expected_variant(conf: Conf, store: Store) -> PlannedVariant:
+    """Return a variant that a dry run does not build.
+
+    The notes that it would have are from the names and headers of the photographs.
 
     Raises:
-        UnreadableError: A photograph can't be read now.
         XrgsError: No variant can be made, even if SfM places every photograph.
     """
     names = scenes.names(conf.scene, conf.variant.long_side)
     sizes, notes = [(1, 1)] * len(names), list[str]()  # other kinds make views of one size
     if conf.scene.kind == "folder":
-        scene = _scene(conf, store)
+        scene = scenes.resolve(conf.scene, store.scenes, conf.variant.long_side)
         photos = photographs.expected_photographs(scene, conf.variant)
         names, sizes = photos.names, [photo.size for photo in photos.all]
         notes = [*scene.notes, *photos.notes]
@@ -315,7 +279,7 @@ def _expected_notes(conf: Conf, store: Store) -> tuple[str, ...]:
     parts = split.split_before_sfm(names, sizes, conf.variant)
     if conf.scene.kind == "folder":
         notes.append(_use_of_photographs(parts, conf.variant))
-    return *notes, *split.split_notes(parts, conf.variant)
+    return PlannedVariant(notes=(*notes, *split.split_notes(parts, conf.variant)))
 
 
 def _use_of_photographs(parts: split.Split, conf: VariantConf) -> str:
@@ -334,14 +298,7 @@ def _use_of_photographs(parts: split.Split, conf: VariantConf) -> str:
 def _check_held_out(names: Sequence[str], conf: Conf, notes: Iterable[str] = ()) -> None:
     """Refuse a split with too few photographs to train on, or none to test, though all be placed.
 
-    Args:
-        names: The names of the photographs, sorted. Some may turn out to be unreadable, and leave
-            even fewer.
-        conf: A cell's config.
-        notes: Notes on the photographs, for the end of the message.
-
-    Raises:
-        XrgsError: There are too few; the message says what helps.
+    The names are sorted; notes on the photographs are for the end of the message.
     """
     parts = split.split_views(names, conf.variant)
     if not split.shortage(parts, set(range(len(names))), conf.variant):

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 import time
 from collections import Counter
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
@@ -48,12 +49,11 @@ class Item:
     """One thing that is removed or trimmed."""
 
     kind: str
-    """The kind of thing, in the plural: `cells of old code`."""
+    """In the plural: `cells of old code`."""
     name: str
-    """Its name for people."""
     bytes: int
     lease: str | None
-    """The name of the lease to hold while it is removed; None where it needs no lease."""
+    """The name of the lease to hold while it is removed."""
     act: Callable[[], str | None]
     """Removes the thing; returns the reason where it is left."""
 
@@ -95,23 +95,19 @@ def plan_removal(store: Store, cells: Sequence[CellRow]) -> Plan:
 def plan_trim(
     store: Store, cells: Sequence[CellRow], chosen: Sequence[CellRow], *, variants: bool
 ) -> Plan:
-    """Plan to remove the Gaussians and renders of done cells, and the images of their variants.
+    """Plan to remove the Gaussians and renders of chosen cells that are done.
 
-    Args:
-        store: The store.
-        cells: All cells of the store.
-        chosen: The cells to trim; unfinished ones are left alone.
-        variants: Also remove the images of the chosen cells' variants, where all cells of the store
-            that use them are done, and no sweep is running.
+    With `variants`, plan to remove the images of their variants too, where all cells of the store
+    that use them are done, and no sweep is running.
     """
     done = [cell for cell in chosen if cell.state.name == "done"]
     left = len(chosen) - len(done)
     notes = [f"left alone, not done: {counted(left, 'cell')}"] if left else []
-    items = [
-        Item("cells", cell.name, size, cell.id, cell.folder.trim)
-        for cell in done
-        if (size := _heavy_bytes(cell))
-    ]
+    items = []
+    for cell in done:
+        with suppress(OSError):
+            if size := cell.folder.heavy_bytes():
+                items.append(Item("cells", cell.name, size, cell.id, cell.folder.trim))
     if variants and any(cell.state.name == "running" for cell in cells):
         notes.append(_RUNNING)
     elif variants:
@@ -130,17 +126,10 @@ def plan_trim(
 
 
 def plan_gc(store: Store, cells: Sequence[CellRow], of: Sequence[str]) -> Plan:
-    """Plan to remove everything that no sweep of the installed code needs.
+    """Plan to remove what no sweep of the installed code needs.
 
-    Args:
-        store: The store.
-        cells: All cells of the store.
-        of: Names of `GARBAGE`: cells of old code, failed cells and scenes, folders that were set
-            aside, and variants without a cell.
-
-    Raises:
-        XrgsError: A name is not one of these.
-        StoreError: A folder of the store can't be listed.
+    `of` has names of `GARBAGE`: cells of old code, failed cells and scenes, folders that were set
+    aside, and variants without a cell. `cells` are all cells of the store.
     """
     for name in of:
         if name not in GARBAGE:
@@ -172,32 +161,26 @@ def carry_out(store: Store, plan: Plan) -> tuple[int, list[str]]:
     """Remove the items of a plan; one that can't be removed does not keep the others.
 
     Returns:
-        The number of bytes that were freed, and a line for each item that was left, with the
-        reason.
+        The bytes that were freed, and a line for each item that was left, with the reason.
     """
     freed, left = 0, list[str]()
     for item in plan.items:
+        held = None
         try:
-            why = _under_lease(store, item)
+            if item.lease and (held := lease.acquire(store.leases, item.lease)) is None:
+                why: str | None = "it is left: a sweep is training it"
+            else:
+                why = item.act()
         except (OSError, StoreError) as error:
             why = str(error)
+        finally:
+            if held:
+                held.release()
         if why:
             left.append(for_line(f"{item.name}: {why}"))
         else:
             freed += item.bytes
     return freed, left
-
-
-def _under_lease(store: Store, item: Item) -> str | None:
-    if item.lease is None:
-        return item.act()
-    held = lease.acquire(store.leases, item.lease)
-    if held is None:
-        return "it is left: a sweep is training it"
-    try:
-        return item.act()
-    finally:
-        held.release()
 
 
 def _without_running(cells: Iterable[CellRow]) -> tuple[list[CellRow], list[str]]:
@@ -234,13 +217,6 @@ def _remove_cell(store: Store, cell: CellRow) -> str:
         return f"it is left: it was {cell.state.name}, and is {state} now"
     remove_cell(cell.folder)
     return ""
-
-
-def _heavy_bytes(cell: CellRow) -> int:
-    try:
-        return cell.folder.heavy_bytes()
-    except OSError:
-        return 0
 
 
 def _paths(folder: Path) -> list[Path]:

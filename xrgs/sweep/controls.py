@@ -18,11 +18,7 @@ if TYPE_CHECKING:
 
 
 def check_reference(cell: PlannedCell, reference: PlannedCell) -> None:
-    """Refuse the baseline as a control, and a reference that is count-matched itself.
-
-    Raises:
-        XrgsError: The message names the reference and says what to do.
-    """
+    """Refuse the baseline as a control, and a reference that is count-matched itself."""
     key = f"matched_to={cell.conf.matched_to}"
     if not cell.spec.changes:
         raise XrgsError(
@@ -39,12 +35,7 @@ def check_reference(cell: PlannedCell, reference: PlannedCell) -> None:
 def check_effect(combinations: Iterable[CellSpec], plan: Iterable[PlannedCell]) -> None:
     """Refuse a `matched_to` without effect, and a count-matched cell without a reference.
 
-    Args:
-        combinations: The combinations of the command line's axes, with `matched_to`.
-        plan: The cells that are planned for them.
-
-    Raises:
-        XrgsError: The message names the value of `matched_to`.
+    `combinations` are those of the command line's axes, for which the plan is.
     """
     plan = list(plan)
     for cell in plan:

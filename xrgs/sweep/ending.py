@@ -22,12 +22,7 @@ _ID = 8
 
 
 def ending(plan: Sequence[PlannedCell], store: Path) -> str:
-    """Return the text after a sweep's report: the ids of its done cells, and commands to go on.
-
-    Args:
-        plan: The cells of the sweep, after it has ended.
-        store: The folder of the store.
-    """
+    """Return the text after a sweep's report: the ids of its done cells, and commands to go on."""
     done = [cell for cell in plan if cell.cell_id and cell.state.name == "done"]
     if not done:
         return ""
@@ -47,10 +42,8 @@ def ending(plan: Sequence[PlannedCell], store: Path) -> str:
 def next_commands(cells: Sequence[str], name: str, store: Path) -> list[str]:
     """Return the commands that show trained cells, make a film of them, and export the last.
 
-    Args:
-        cells: One cell or two of one variant, as a command takes them.
-        name: Name of the files, without a suffix.
-        store: The folder of the store.
+    The cells are one, or two of one variant, as a command takes them. The files that are written
+    get the name, and a suffix.
     """
     words = shlex.join(cells)
     where = "" if store == DEFAULT_STORE else f" --store {shlex.quote(str(store))}"

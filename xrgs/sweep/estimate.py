@@ -56,9 +56,8 @@ class Cost:
     scoring_s: float
     """Seconds of the final scoring."""
     memory_bytes: float
-    """Resident memory of its process where that is largest."""
+    """The most resident memory of its process."""
     disk_bytes: float
-    """Size of its files when it is done."""
 
     def left_s(self, trained: float) -> float:
         """Return the seconds to the end of a cell of whose training this share is done."""
@@ -77,10 +76,7 @@ class _Finished:
     threads: int
     backend: str
     processor: str
-    training_s: float
-    overhead_s: float
-    memory_bytes: float
-    disk_bytes: float
+    cost: Cost
 
 
 class CostEstimator:
@@ -90,11 +86,13 @@ class CostEstimator:
         """Read the newest finished cells; a cell that can't be read is left out."""
         self._store = store
         self._finished: list[_Finished] = []
-        for cell in _newest(store):
-            try:
+        newest: list[CellFolder] = []
+        with suppress(OSError, StoreError):
+            cells = [cell for cell in store.cell_folders() if cell.status_file.exists()]
+            newest = heapq.nlargest(_MAX_CELLS, cells, key=lambda cell: cell.path.stat().st_mtime)
+        for cell in newest:
+            with suppress(XrgsError, OSError, ValueError):
                 self._finished.append(self._read(cell))
-            except (XrgsError, OSError, ValueError):
-                continue
 
     @property
     def known(self) -> int:
@@ -107,6 +105,7 @@ class CostEstimator:
         variant_id = cell.identity().variant
         ended, started = cell.status_file.stat().st_mtime, datetime.fromisoformat(made.started)
         overhead = ended - started.timestamp() - summary.training_time_s
+        overhead = overhead if 0 < overhead < _MAX_OVERHEAD_S else 0.0
         files = {**status.files, **status.trimmed}
         return _Finished(
             settings=_settings(conf),
@@ -116,19 +115,18 @@ class CostEstimator:
             threads=made.threads,
             backend=made.backend,
             processor=processor(made),
-            training_s=summary.training_time_s,
-            overhead_s=overhead if 0 < overhead < _MAX_OVERHEAD_S else 0.0,
-            memory_bytes=summary.peak_rss_bytes or 0.0,
-            disk_bytes=sum(entry.bytes for entry in files.values()),
+            cost=Cost(
+                summary.training_time_s + overhead,
+                overhead,
+                summary.peak_rss_bytes or 0.0,
+                sum(entry.bytes for entry in files.values()),
+            ),
         )
 
     def cost(self, conf: Conf, variant_id: str | None, threads: int) -> Cost | None:
         """Return the expected cost of a cell; None if the store has no finished cell of its kind.
 
-        Args:
-            conf: The cell's config.
-            variant_id: The id of its variant; None while the variant is not built.
-            threads: Number of threads that train it.
+        The variant has no id while it is not built.
         """
         backend = resolve_backend(conf.splat.backend)
         # Times of a GPU and of a processor say nothing about each other.
@@ -137,18 +135,14 @@ class CostEstimator:
         if not finished:
             return None
         settings, here = _settings(conf), this_processor(backend)
-
-        def distance(past: _Finished) -> int:
-            return (
-                len(settings ^ past.settings)
-                + _OTHER_VARIANT * (past.variant_id != variant_id)
-                + _OTHER_PROCESSOR * (past.processor != here)
-                + _OTHER_BACKEND * (past.backend != backend)
-            )
-
-        distances = [distance(past) for past in finished]
-        least = min(distances)
-        nearest = [p for p, far in zip(finished, distances, strict=True) if far == least]
+        by_distance: dict[int, list[_Finished]] = {}
+        for past in finished:
+            distance = len(settings ^ past.settings)
+            distance += _OTHER_VARIANT * (past.variant_id != variant_id)
+            distance += _OTHER_PROCESSOR * (past.processor != here)
+            distance += _OTHER_BACKEND * (past.backend != backend)
+            by_distance.setdefault(distance, []).append(past)
+        nearest = by_distance[min(by_distance)]
         pixels = None
         if variant_id is not None:
             with suppress(StoreError):
@@ -161,13 +155,13 @@ class CostEstimator:
 def _scaled(past: _Finished, conf: Conf, pixels: float, threads: int, backend: str) -> Cost:
     """Scale the cost of a finished cell to a planned one."""
     ratio = pixels / past.pixels
-    training = past.training_s * conf.train.steps / past.steps * ratio
+    seconds, overhead, memory, disk = (ratio * value for value in astuple(past.cost))
+    training = (seconds - overhead) * conf.train.steps / past.steps
     if backend != past.backend:
         training *= TORCH_SLOWDOWN if backend == "torch" else 1 / TORCH_SLOWDOWN
     if backend != "gsplat":
         training *= max(1, past.threads) / max(1, threads)
-    overhead = past.overhead_s * ratio
-    return Cost(training + overhead, overhead, past.memory_bytes * ratio, past.disk_bytes * ratio)
+    return Cost(training + overhead, overhead, memory, disk)
 
 
 def _settings(conf: Conf) -> frozenset[tuple[str, str]]:
@@ -186,11 +180,7 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, st
 
 @cache
 def read_views(variants: Path, variant_id: str) -> tuple[ViewEntry, ...]:
-    """Return the list of a variant's views, trimmed or not.
-
-    Raises:
-        StoreError: The list can't be read.
-    """
+    """Return the list of a variant's views, trimmed or not."""
     folder = variants / variant_id
     if not folder.is_dir():
         folder = trimmed_folder(variants, variant_id)
@@ -198,11 +188,7 @@ def read_views(variants: Path, variant_id: str) -> tuple[ViewEntry, ...]:
 
 
 def _pixels(variants: Path, variant_id: str, conf: Conf) -> tuple[float, int]:
-    """Return the pixels of a cell's render, mean over the steps, and of its largest view.
-
-    Raises:
-        StoreError: The variant's list of views can't be read, or has none that is trained on.
-    """
+    """Return the pixels of a cell's render, mean over the steps, and of its largest view."""
     views = read_views(variants, variant_id)
     # Originals take the place of degraded views.
     splits = ("train", "original") if conf.train.views == "all_hr" else ("train",)
@@ -234,18 +220,6 @@ def _pixels(variants: Path, variant_id: str, conf: Conf) -> tuple[float, int]:
 
 
 def units_of_a_step(store: Store, conf: Conf, variant_id: str) -> float:
-    """Return the pixels and the Gaussians of a step of a cell, mean over the steps.
-
-    Raises:
-        StoreError: The variant's list of views can't be read.
-    """
+    """Return the pixels and the Gaussians of a step of a cell, mean over the steps."""
     mean, largest = _pixels(store.variants, variant_id, conf)
     return mean + GAUSSIANS_OF_A_PIXEL * largest
-
-
-def _newest(store: Store) -> list[CellFolder]:
-    try:
-        cells = [cell for cell in store.cell_folders() if cell.status_file.exists()]
-        return heapq.nlargest(_MAX_CELLS, cells, key=lambda cell: cell.path.stat().st_mtime)
-    except (OSError, StoreError):
-        return []

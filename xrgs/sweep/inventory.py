@@ -33,71 +33,45 @@ _NAMES = frozenset({"cell_id", "scene", "label", "condition", "variant"})
 
 
 def list_cells(cells: Sequence[CellRow], sort: str) -> str:
-    """Return cells as a table for a terminal.
-
-    Args:
-        cells: The cells.
-        sort: `name`, `age` (the oldest last) or `size` (the largest last).
-
-    Raises:
-        XrgsError: `sort` has another value.
-    """
+    """Return cells as a table, by `name`, `age` (the oldest last) or `size` (the largest last)."""
     if sort not in {"name", "age", "size"}:
         raise XrgsError(f"sort={sort}: choose name, age or size")
     if sort != "name":
         cells = sorted(cells, key=lambda row: (row.age_s if sort == "age" else row.bytes) or 0)
-    rows = [
-        (
-            *(row.id, row.scene, row.arm, str(row.seed), _state(row)),
-            *(format_age(row.age_s), format_size(row.bytes)),
-        )
-        for row in cells
-    ]
+    rows = []
+    for row in cells:
+        marks = ["trimmed"] * row.folder.is_trimmed() + ["old code"] * bool(row.stale)
+        state = row.state.name + (f" ({', '.join(marks)})" if marks else "")
+        names = (row.id, row.scene, row.arm, str(row.seed), state)
+        rows.append((*names, format_age(row.age_s), format_size(row.bytes)))
     total = format_size(sum(row.bytes or 0 for row in cells))
     columns = ("cell", "scene", "ablation", "seed", "state", "age", "size")
     title = f"{counted(len(rows), 'cell')}, {total}"
     return to_text(TextTable(title, columns, tuple(rows), "lllrlrr")).rstrip()
 
 
-def _state(row: CellRow) -> str:
-    marks = ["trimmed"] if row.folder.is_trimmed() else []
-    marks += ["old code"] if row.stale else []
-    return row.state.name + (f" ({', '.join(marks)})" if marks else "")
-
-
 def list_sweeps(sweeps: Sequence[SweepRow]) -> str:
     """Return recorded sweeps as a table for a terminal."""
-    rows = [
-        (
-            row.id,
-            _date(row.recorded_at),
-            _distinct(cell.scene for cell in row.record.cells),
-            _distinct(cell.label for cell in row.record.cells),
-            _counts(row),
-        )
-        for row in sweeps
-    ]
+    rows = []
+    for row in sweeps:
+        recorded, when = row.record.cells, "?"
+        if row.recorded_at:
+            local = datetime.fromtimestamp(row.recorded_at, UTC).astimezone()
+            when = local.strftime("%Y-%m-%d %H:%M")
+        scenes = _distinct(cell.scene for cell in recorded)
+        labels = _distinct(cell.label for cell in recorded)
+        done = f"{row.states['done']} of {len(recorded)} done"
+        others = sorted(row.states.keys() - {"done"}, key=lambda name: (name == "pending", name))
+        counts = ", ".join([done, *(f"{row.states[name]} {name}" for name in others)])
+        rows.append((row.id, when, scenes, labels, counts))
     columns = ("sweep", "recorded", "scenes", "labels", "cells")
     return to_text(TextTable(counted(len(rows), "sweep"), columns, tuple(rows), "lllll")).rstrip()
-
-
-def _counts(sweep: SweepRow) -> str:
-    """Return a text such as `3 of 12 done, 1 running, 8 pending`."""
-    done = f"{sweep.states['done']} of {len(sweep.record.cells)} done"
-    names = sorted(sweep.states.keys() - {"done"}, key=lambda name: (name == "pending", name))
-    return ", ".join([done, *(f"{sweep.states[name]} {name}" for name in names)])
 
 
 def _distinct(names: Iterable[str]) -> str:
     distinct = list(dict.fromkeys(names))
     more = len(distinct) - _MAX_LISTED
     return ", ".join(distinct[:_MAX_LISTED]) + (f" and {more} more" if more > 0 else "")
-
-
-def _date(seconds: float | None) -> str:
-    if seconds is None:
-        return "?"
-    return datetime.fromtimestamp(seconds, UTC).astimezone().strftime("%Y-%m-%d %H:%M")
 
 
 def show(store: Store, cell: CellRow) -> str:

@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 
     from omegaconf import DictConfig
 
-    from xrgs.config import Conf
+    from xrgs.config import Conf, LimitsConf
     from xrgs.store.schema import Identity
 
 #: Outcomes of a job other than the states of a cell. LOCKED: another process trains the cell.
@@ -89,34 +89,19 @@ _WATCHER = "trap '' TERM INT HUP; read -r _; kill -s KILL -- -$1"
 
 
 @dataclass(frozen=True)
-class Limits:
-    """Limits of a process and all its children; 0 means no limit."""
-
-    minutes: float = 0.0
-    """Wall time, minutes."""
-    memory_gb: float = 0.0
-    """Resident memory of all processes together, in 10^9 bytes, read every 0.2 s. RLIMIT_AS is no
-    substitute: torch alone maps several times the memory that it uses."""
-
-
-_NO_LIMITS = Limits()
-
-
-@dataclass(frozen=True)
 class ProcessEnd:
     """How a process ended."""
 
     code: int
     """Its exit code, or minus the number of the signal that ended it."""
     reason: str = ""
-    """The limit that it exceeded; empty if it ended by itself."""
+    """The limit that it exceeded."""
 
 
 class Answer(msgspec.Struct, frozen=True):
     """The child's answer when its work has ended."""
 
     result: dict[str, Any] = {}
-    """The result of the work, as plain JSON values."""
     error: str | None = None
     """Why the work failed."""
     outcome: str = "failed"
@@ -126,13 +111,11 @@ class Answer(msgspec.Struct, frozen=True):
 class WorkError(XrgsError):
     """Work in a child process has no result.
 
-    Attributes:
-        outcome: `failed`, or the outcome of work that is not known to be faulty: `LOCKED`,
-            `STOPPED`, `UNWRITABLE` or `INTERRUPTED`.
+    Its outcome is `failed`, or that of work that is not known to be faulty: `LOCKED`, `STOPPED`,
+    `UNWRITABLE` or `INTERRUPTED`.
     """
 
     def __init__(self, reason: str, outcome: str = "failed") -> None:
-        """Keep the reason, which is the message, and the outcome."""
         super().__init__(reason)
         self.outcome = outcome
 
@@ -143,11 +126,7 @@ class WorkError(XrgsError):
 def run_hydra_job(cfg: DictConfig) -> str:
     """Run one job of a sweep: Hydra's launcher calls this, here or on another machine.
 
-    Args:
-        cfg: Hydra's settings, and `cell`, `store` and `name` (`xrgs.sweep.study`).
-
-    Returns:
-        As `run_job`.
+    The config has Hydra's settings, and `cell`, `store` and `name` (`xrgs.sweep.study`).
     """
     # The child, which imports this file too, starts sooner without Hydra.
     from hydra.core.hydra_config import HydraConfig
@@ -170,12 +149,6 @@ def run_hydra_job(cfg: DictConfig) -> str:
 def run_job(session: SweepSession, store: Store, cell_id: str, name: str) -> str:
     """Run one cell of a sweep, unless there is a reason not to.
 
-    Args:
-        session: The call of `xrgs-sweep` that the job belongs to.
-        store: The store. The cell's folder in it has the cell's config and identity.
-        cell_id: The cell's id.
-        name: The cell's name for people.
-
     Returns:
         The cell's state, or `LOCKED`, `STOPPED`, `UNWRITABLE`, `GONE` or `INTERRUPTED`.
 
@@ -196,23 +169,18 @@ def run_job(session: SweepSession, store: Store, cell_id: str, name: str) -> str
         conf = cell.config()
         outcome = _run_under_lease(cell, name, conf, store, session)
     except (OSError, StoreError) as error:
-        outcome = _outcome_of(error, store)
-        if outcome != GONE:
-            log_line(f"store={store.path}: {error}")
+        if store.is_gone:
+            return GONE
+        if isinstance(error, StoreError) and not isinstance(error, UnreadableError):
+            raise
+        log_line(f"store={store.path}: {error}")
+        full = isinstance(error, OSError) and unwritable(error)
+        outcome = UNWRITABLE if full else "failed"
     if outcome == UNWRITABLE:
         session.stop(STORE_FULL)
     if conf is not None and conf.fail_fast and outcome == "failed":
         session.stop(FAIL_FAST)
     return outcome
-
-
-def _outcome_of(error: OSError | StoreError, store: Store) -> str:
-    """Return the outcome of a job after an OSError; raise an error of a damaged file again."""
-    if store.is_gone:
-        return GONE
-    if isinstance(error, StoreError) and not isinstance(error, UnreadableError):
-        raise error
-    return UNWRITABLE if isinstance(error, OSError) and unwritable(error) else "failed"
 
 
 def _run_under_lease(
@@ -248,11 +216,7 @@ def _run_under_lease(
 
 
 def _check_code(name: str, cell_id: str, conf: Conf, planned: Identity) -> None:
-    """Refuse to train with other code or other arithmetic than the cell was planned with.
-
-    Raises:
-        XrgsError: They differ; the message names the parts of the program that do.
-    """
+    """Refuse to train with other code or other arithmetic than the cell was planned with."""
     if parts := changed_code(planned):
         raise XrgsError(
             f"{name}: cell {cell_id} was planned with other code than is installed here and now"
@@ -294,11 +258,10 @@ def _train_in_child(
         if session.owner_dead:
             raise WorkError("its sweep's process has ended", STOPPED)
 
-    limits = Limits(conf.limits.minutes, conf.limits.memory_gb)
     try:
         request = cell_request(variant, cell)
         with _own_gpu(session, conf.splat.backend) as environment:
-            answer = run_in_child("cell", request, limits, on_poll, environment)
+            answer = run_in_child("cell", request, conf.limits, on_poll, environment)
     except XrgsError as error:
         return _after_error(error, store, cell, held)
     for line in () if session.brief else answer["found"]:
@@ -354,45 +317,30 @@ def _after_error(error: XrgsError, store: Store, folder: CellFolder, held: lease
 
 
 def restore_images(conf: Conf, store: Store, variant_id: str) -> None:
-    """Make the images of a trimmed variant again, in a child process.
+    """Make the images of a variant again, in a child process, if it is trimmed.
 
-    Args:
-        conf: The config of a cell of the variant, of which only scene and variant are read.
-        store: The store.
-        variant_id: The variant's id. A variant that is not trimmed is left as it is.
+    Scene and variant are taken from `conf`, the config of any of its cells.
 
     Raises:
-        UnreadableError: A file can't be read now.
-        StoreGoneError: The store is no longer there.
         XrgsError: The photographs are missing or give other images, or the disk is full.
     """
     if not trimmed_folder(store.variants, variant_id).is_dir():
         return
     log_line(f"variant {variant_id}: making the images again that xrgs-store trim has removed")
     request = {"conf": asdict(conf), "store": str(store.path), "variant": variant_id}
-    run_in_child("restore", request, _NO_LIMITS, lambda _: store.check_not_gone())
+    run_in_child("variant", request, None, lambda _: store.check_not_gone())
 
 
 def run_in_child(
     work: str,
     request: Mapping[str, Any],
-    limits: Limits = _NO_LIMITS,
+    limits: LimitsConf | None = None,
     on_poll: Callable[[int], None] = lambda _: None,
     environment: Mapping[str, str] = MappingProxyType({}),
 ) -> dict[str, Any]:
-    """Do one piece of work in a child process and return its answer.
+    """Do one piece of work, see `_WORK`, in a child process and return its answer.
 
-    Args:
-        work: `variant` to build a variant, `restore` to make the images of a trimmed one again, or
-            `cell` to train a cell.
-        request: The arguments of the work, as plain JSON values.
-        limits: The child is ended when it exceeds them.
-        on_poll: Called repeatedly while the child runs, with its process id. An exception that it
-            raises ends the child and is raised here.
-        environment: Variables that the child has besides those of this process.
-
-    Returns:
-        The answer of the work, as plain JSON values.
+    Request and answer are plain JSON values; other arguments are as for `run_supervised`.
 
     Raises:
         WorkError: The work has no result; the message is the reason.
@@ -446,20 +394,15 @@ def _death(code: int) -> WorkError:
 
 def run_supervised(
     command: Sequence[str],
-    limits: Limits,
+    limits: LimitsConf | None = None,
     on_poll: Callable[[int], None] = lambda _: None,
     environment: Mapping[str, str] = MappingProxyType({}),
 ) -> ProcessEnd:
     """Run a command, in a session of its own, until it ends or exceeds a limit.
 
-    Its standard input is a pipe that ends when this process does (see `follow_parent`).
-
-    Args:
-        command: The program and its arguments.
-        limits: The process and its children are ended when they exceed them.
-        on_poll: Called repeatedly while the process runs, with its process id. An exception that
-            it raises ends the process and is raised here.
-        environment: Variables that the process has besides those of this process.
+    Its standard input is a pipe that ends when this process does (see `follow_parent`). Variables
+    of `environment` are added to those of this process. `on_poll` is called again and again with
+    the process id; an exception that it raises ends the process and is raised here.
     """
     child = subprocess.Popen(  # noqa: S603
         command, stdin=subprocess.PIPE, start_new_session=True, env=os.environ | environment
@@ -472,20 +415,22 @@ def run_supervised(
     return ProcessEnd(child.returncode, reason)
 
 
-def _watch(child: subprocess.Popen[bytes], limits: Limits, on_poll: Callable[[int], None]) -> str:
-    """Wait until the child ends or exceeds a limit; return which limit, or nothing."""
+def _watch(
+    child: subprocess.Popen[bytes], limits: LimitsConf | None, on_poll: Callable[[int], None]
+) -> str:
+    """Wait until the child ends or exceeds a limit; return which limit, or nothing.
+
+    RLIMIT_AS is no substitute: torch alone maps several times the memory that it uses.
+    """
+    minutes, memory_gb = (limits.minutes, limits.memory_gb) if limits else (0.0, 0.0)
     start, pause = time.monotonic(), 0.01
     while child.poll() is None:
-        minutes = (time.monotonic() - start) / 60
-        if limits.minutes and minutes > limits.minutes:
-            return f"it took longer than limits.minutes={limits.minutes:g} and was ended"
-        if (
-            limits.memory_gb
-            and (used := processes.resident_bytes(child.pid) / 1e9) > limits.memory_gb
-        ):
+        if minutes and time.monotonic() - start > 60 * minutes:
+            return f"it took longer than limits.minutes={minutes:g} and was ended"
+        if memory_gb and (used := processes.resident_bytes(child.pid) / 1e9) > memory_gb:
             return (
-                f"out of memory: it used {used:.2f} GB, more than "
-                f"limits.memory_gb={limits.memory_gb:g}, and was ended"
+                f"out of memory: it used {used:.2f} GB, more than limits.memory_gb={memory_gb:g},"
+                " and was ended"
             )
         on_poll(child.pid)
         time.sleep(pause)
@@ -499,9 +444,7 @@ def _end(child: subprocess.Popen[bytes], *, exceeded: bool) -> None:
         if exceeded:  # its stack tells what took so long
             child.send_signal(_STACK_SIGNAL)
         _signal(child, signal.SIGTERM)
-        if exceeded:
-            _ends_within(child, _LIMIT_GRACE_S)
-        elif not _ends_within(child, min(_SILENT_S, _GRACE_S)):
+        if not _ends_within(child, _LIMIT_GRACE_S if exceeded else _SILENT_S) and not exceeded:
             log_line(
                 f"waiting at most {_GRACE_S:.0f} s for the cell to keep its state; another Ctrl-C"
                 " ends it at once"
@@ -528,23 +471,18 @@ def _signal(child: subprocess.Popen[bytes], number: int) -> None:
 # In the child
 
 
-def _build_variant(request: Mapping[str, Any]) -> dict[str, Any]:
+def _make_variant(request: Mapping[str, Any]) -> dict[str, Any]:
+    """Build a variant, or make the images of the one that is named again."""
     from xrgs.composing import from_dict
     from xrgs.mixture import variant
-
-    log_to_stderr()
-    conf, store = from_dict(request["conf"]), Store(Path(request["store"]))
-    built = variant.build(conf.scene, conf.variant, store.variants, store.scenes)
-    return {"variant": built.id}
-
-
-def _restore_variant(request: Mapping[str, Any]) -> dict[str, Any]:
-    from xrgs.composing import from_dict
     from xrgs.store.trimming import restore_variant
 
     log_to_stderr()
     conf, store = from_dict(request["conf"]), Store(Path(request["store"]))
-    restore_variant(store.variants, request["variant"], conf.scene, conf.variant, store.scenes)
+    if (trimmed := request.get("variant")) is None:
+        built = variant.build(conf.scene, conf.variant, store.variants, store.scenes)
+        return {"variant": built.id}
+    restore_variant(store.variants, trimmed, conf.scene, conf.variant, store.scenes)
     return {}
 
 
@@ -587,13 +525,9 @@ def _enter_folder(folder: Path, inode: int) -> None:
     os.close(log)
 
 
-def _store_is_gone(request: Mapping[str, Any]) -> bool:
-    return "store" in request and Store(Path(request["store"])).is_gone
-
-
+#: The kinds of work: building a variant or making its images again, and training a cell.
 _WORK: dict[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
-    "variant": _build_variant,
-    "restore": _restore_variant,
+    "variant": _make_variant,
     "cell": _run_cell,
 }
 
@@ -611,13 +545,7 @@ def follow_parent() -> None:
 
 
 def main(work: str, request: str, answer: str) -> None:
-    """Do one piece of work in the child, and write its answer or the reason why it failed.
-
-    Args:
-        work: `variant`, `restore` or `cell`.
-        request: JSON file with the arguments.
-        answer: File for the answer.
-    """
+    """Do one piece of work in the child, and write its answer or the reason why it failed."""
     guard_streams()
     faulthandler.enable()
     follow_parent()
@@ -626,12 +554,10 @@ def main(work: str, request: str, answer: str) -> None:
     try:
         given = read_struct(Path(request), dict[str, Any])
         result = Answer(_WORK[work](given))
-    except WorkError as error:
-        result = Answer(error=str(error), outcome=error.outcome)
     except XrgsError as error:
-        result = Answer(error=str(error))
+        result = Answer(error=str(error), outcome=getattr(error, "outcome", "failed"))
     except Exception as error:
-        if not _store_is_gone(given):  # the parent says so
+        if "store" not in given or not Store(given["store"]).is_gone:  # the parent says so
             say(traceback.format_exc(), sys.stderr)
         full = isinstance(error, OSError) and unwritable(error)
         outcome = UNWRITABLE if full else "failed"

@@ -34,9 +34,7 @@ class Capacity:
     def threads(self, jobs: int, machine: int) -> int:
         """Return the threads of each job of a batch; 0 for every core that the job finds.
 
-        Args:
-            jobs: Number of jobs of the batch.
-            machine: Cores of this machine.
+        `machine` is the number of cores of this machine.
         """
         if self.cores or self.at_once is None:
             return self.cores
@@ -94,16 +92,9 @@ def one_cell_a_gpu(launcher: DictConfig, allowed: Capacity, count: int) -> Capac
     """Return a capacity for cells that each take a GPU (`splat.backend=gsplat`).
 
     SLURM and Ray are asked for a GPU a job, unless the launcher's settings ask for some already.
-    Other launchers run no more jobs at once than this machine has GPUs; a job takes a free one
-    (`xrgs.sweep.job`). A launcher that is not in `CAPACITIES` decides by itself.
-
-    Args:
-        launcher: `hydra.launcher`.
-        allowed: The capacity without GPUs.
-        count: Number of GPUs of this machine.
-
-    Raises:
-        XrgsError: The jobs run on this machine, and it has no GPU.
+    Other launchers run no more jobs at once than this machine has GPUs, whose `count` is given; a
+    job takes a free one (`xrgs.sweep.job`). A launcher that is not in `CAPACITIES` decides by
+    itself.
     """
     settings = dict(allowed.settings)
     kind = str(launcher["_target_"]).rpartition(".")[2]
@@ -127,26 +118,16 @@ def one_cell_a_gpu(launcher: DictConfig, allowed: Capacity, count: int) -> Capac
 
 
 def capacity(launcher: DictConfig, threads: int, machine: int) -> Capacity:
-    """Return how many jobs a launcher runs at once, and with how many cores.
+    """Return how many jobs a launcher runs at once, and with how many cores, see `CAPACITIES`.
 
-    Args:
-        launcher: `hydra.launcher`. One that is not in `CAPACITIES` decides by itself.
-        threads: Threads of a cell that the user asks for; 0 for no preference.
-        machine: Cores that this process may use.
-
-    Raises:
-        XrgsError: The launcher's configuration is invalid.
+    A launcher that is not there decides by itself.
     """
     capacity_of = CAPACITIES.get(str(launcher["_target_"]).rpartition(".")[2])
     return capacity_of(launcher, threads, machine) if capacity_of else Capacity(cores=threads)
 
 
 def check(config: DictConfig, cell: DictConfig | None = None) -> None:
-    """Refuse a launcher that is not installed, and a cell with a launcher of its own.
-
-    Raises:
-        XrgsError: The message says what to install, or where to choose the launcher.
-    """
+    """Refuse a launcher that is not installed, and a cell with a launcher of its own."""
     launcher = OmegaConf.to_container(config.hydra.launcher, resolve=False)
     if isinstance(launcher, dict) and "install" in launcher:  # see hydra_plugins/xrgs_sweeper.py
         name, package = config.hydra.runtime.choices["hydra/launcher"], launcher["install"]

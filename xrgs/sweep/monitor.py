@@ -60,14 +60,9 @@ class RunningCell:
     """The share of its training steps that are done, 0 to 1."""
 
     @property
-    def trains(self) -> bool:
-        """Whether the progress counts training steps."""
-        return self.progress.unit == "step"
-
-    @property
-    def pace(self) -> float | None:
-        """Recent seconds per step; None while the cell is not training or just began."""
-        return 1 / self.progress.rate if self.trains and self.progress.rate else None
+    def rate(self) -> float:
+        """Recent steps per second; 0 while the cell is not training or just began."""
+        return (self.progress.unit == "step" and self.progress.rate) or 0.0
 
 
 @dataclass(frozen=True)
@@ -123,12 +118,7 @@ class SweepSnapshot:
         return max(cell.trained, self.shares.get(str(cell.cell_id), 0.0))
 
     def expected_s(self, cell: PlannedCell, trained: float) -> float | None:
-        """Return the expected seconds of a cell to its end; None if unknown.
-
-        Args:
-            cell: The cell.
-            trained: The share of its training that is done, 0 to 1.
-        """
+        """Return the expected seconds to the end of a cell of whose training this share is done."""
         if cell.cost is not None:
             return cell.cost.left_s(trained) * self.slowness
         return None if self.pace is None else (1 - trained) * cell.conf.train.steps * self.pace
@@ -136,7 +126,7 @@ class SweepSnapshot:
     def rest_s(self, running: RunningCell) -> float | None:
         """Return the expected seconds to the end of a running cell; None if unknown."""
         cost, by_store = running.cell.cost, self.expected_s(running.cell, running.share)
-        by_pace = running.progress.remaining_s if running.trains else None
+        by_pace = running.progress.remaining_s if running.progress.unit == "step" else None
         if by_pace is None or by_store is None or cost is None:
             return by_store if by_pace is None else by_pace
         # A cell's own pace misleads at first, when it has few Gaussians, and is right at the end.
@@ -163,7 +153,7 @@ class SweepSnapshot:
         return ", ".join([*counts, *self._pace_and_rest()])
 
     def _pace_and_rest(self) -> list[str]:
-        rate = sum(1 / cell.pace for cell in self.running if cell.pace)
+        rate = sum(cell.rate for cell in self.running)
         parts = [f"{rate:.3g} steps/s"] if rate else []
         if self.left_s is not None:
             parts.append(f"{format_duration(self.left_s)} left")
@@ -208,12 +198,7 @@ class SweepMonitor:
     """Shows a sweep while a `with` block runs: a bar on a terminal, occasional lines in a log."""
 
     def __init__(self, cells: Path, *, brief: bool = False) -> None:
-        """Prepare to show the cells of a folder; nothing is shown before `watch` is called.
-
-        Args:
-            cells: The folder.
-            brief: Show a single training, see `SweepSnapshot.brief`.
-        """
+        """Prepare to show cells of a folder; with `brief`, a single one without its name."""
         self._cells, self._brief = cells, brief
         self._plan: tuple[PlannedCell, ...] = ()
         self._retry = False
@@ -262,10 +247,9 @@ class SweepMonitor:
         self._thread.join()
         if self._bar is not None:
             self._bar.close()
-        if self._plan:
-            snapshot = self.snapshot()
-            if snapshot.ended != self._shown and not self._brief:
-                log_line(str(snapshot))
+        snapshot = self.snapshot()
+        if snapshot.ended != self._shown and not self._brief:
+            log_line(str(snapshot))
 
     def _folder(self, name: str) -> CellFolder:
         return CellFolder(self._cells / name)
@@ -286,14 +270,14 @@ class SweepMonitor:
         waiting = []
         for cell in self._plan:
             state = self._state(cell, begun)
-            if state in counts:
+            if state:
                 counts[state] += 1
             elif (now := self._progress(cell, begun)) is None:
                 waiting.append(cell)
             else:
                 in_other_sweep = cell.state.name == "running"
                 (elsewhere if in_other_sweep else running).append(self._running(cell, now))
-        paces = [cell.pace for cell in running if cell.pace]
+        paces = [1 / cell.rate for cell in running if cell.rate]
         self._pace = fmean(paces) if paces else self._pace
         self._at_once = max(self._at_once, len(running))
         return SweepSnapshot(

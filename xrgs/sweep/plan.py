@@ -103,7 +103,7 @@ def planned(spec: CellSpec, conf: Conf) -> PlannedCell:
     """Return a planned cell, with two additions from its config.
 
     The label of a count-matched cell gets the name of its reference. The condition gets the scored
-    views where these are not test views, so that nobody takes their scores for those of test views.
+    views where these are not test views.
     """
     scored = ""
     if conf.train.validation:
@@ -118,11 +118,7 @@ def planned(spec: CellSpec, conf: Conf) -> PlannedCell:
 
 
 def check_sizes(conf: Conf) -> None:
-    """Refuse a config with images too small for SSIM, or with invalid values of its variant.
-
-    Raises:
-        XrgsError: A value is out of its range; the message names the key.
-    """
+    """Refuse a config with images too small for SSIM, or with invalid values of its variant."""
     check_variant_conf(conf.variant)
     side, least = conf.variant.long_side, conf.variant.factor * SSIM_WINDOW
     if 0 < side < least:
@@ -137,16 +133,8 @@ def with_variants(
 ) -> tuple[list[PlannedCell], list[str]]:
     """Return the cells with their variants, or with the reasons why there are none.
 
-    Args:
-        plan: The cells.
-        store: The store.
-        allow_build: Build the variants that the store lacks; False for a dry run.
-
-    Returns:
-        The cells, and the notes on the variants, each with its scene.
-
-    Raises:
-        StoreError: The store can't be written, or is no longer there.
+    The notes on the variants are returned too, each with its scene. `allow_build` is as for
+    `build_variants.plan`.
     """
     keys = [digest([to_plain(cell.conf.scene), to_plain(cell.conf.variant)]) for cell in plan]
     confs = {key: cell.conf for key, cell in zip(keys, plan, strict=True)}
@@ -167,9 +155,6 @@ def with_wanted_baselines(plan: Sequence[PlannedCell]) -> list[PlannedCell]:
     """Return the cells without the baselines that `baseline=false` leaves out.
 
     The baseline that a count-matched cell takes its number from stays.
-
-    Raises:
-        XrgsError: No cell is left.
     """
     references = {cell.reference for cell in plan}
     wanted = [
@@ -187,19 +172,15 @@ def with_wanted_baselines(plan: Sequence[PlannedCell]) -> list[PlannedCell]:
 def identified(cell: PlannedCell, store: Store, holders: Mapping[str, str]) -> PlannedCell:
     """Return a cell with its identity, as soon as it is known, and its current state.
 
-    Args:
-        cell: The cell; one that is done is not looked at again.
-        store: The store.
-        holders: Descriptions of the processes that train cells now, by the cells' ids.
+    A cell that is done is not looked at again. `holders` describes the processes that train cells
+    now, by the cells' ids.
     """
     if cell.variant_id is None or cell.waits or cell.state.name == "done":
         return cell
     identity = cell.identity or cell_identity(cell.conf, cell.variant_id)
     name = cell.cell_id or cell_id(identity)
     folder = store.cell(name)
-    state = folder.state()
-    if state.name != "done" and name in holders:
-        state = folder.running(holders[name])
+    state = folder.state(owner=holders.get(name))
     trained = folder.steps_to_resume() / cell.conf.train.steps
     return replace(cell, identity=identity, cell_id=name, state=state, trained=trained)
 
@@ -207,10 +188,7 @@ def identified(cell: PlannedCell, store: Store, holders: Mapping[str, str]) -> P
 def estimated(plan: Sequence[PlannedCell], past: CostEstimator, threads: int) -> list[PlannedCell]:
     """Return the cells with their expected costs, where the store has finished cells to compare.
 
-    Args:
-        plan: The cells.
-        past: Estimates from the store's finished cells.
-        threads: Threads of a cell that asks for no number.
+    A cell that asks for no number of threads has `threads`.
     """
     return [
         cell
@@ -233,10 +211,7 @@ def ready(
 ) -> dict[str, PlannedCell]:
     """Return the cells that can be trained now and are not done, by their ids.
 
-    Args:
-        plan: All cells.
-        tried: Ids of cells that this sweep has trained already, with whatever outcome.
-        retry: Train cells again that failed in an earlier sweep.
+    Those that this sweep has `tried` already are left out, and without `retry` failed ones too.
     """
     left_alone = {"done", "running"} | (set() if retry else {"failed"})
     return {
@@ -258,7 +233,8 @@ def describe(plan: Sequence[PlannedCell]) -> str:
     lines = [f"plan: {counted(len(plan), 'cell')}, {done} done{_remaining(plan)}"]
     reasons = set[str]()
     for cell in plan:
-        state, reason = _shown_state(cell)
+        state = "failed" if cell.error else "waits" if cell.waits else cell.state.name
+        reason = cell.error or cell.state.reason.partition("\n")[0]
         if reason in reasons:
             reason = "the same"
         elif reason:
@@ -276,14 +252,6 @@ def describe(plan: Sequence[PlannedCell]) -> str:
     if hint := build_variants.how_to_get([cell.conf.scene for cell in plan if cell.error]):
         lines.append(hint)
     return "\n".join(map(for_line, lines))
-
-
-def _shown_state(cell: PlannedCell) -> tuple[str, str]:
-    """Return the state of a cell and the reason for it, for the plan's text."""
-    reason = cell.state.reason.partition("\n")[0]
-    if cell.error:
-        return "failed", cell.error
-    return "waits" if cell.waits else cell.state.name, reason
 
 
 def without_kernels(plan: Sequence[PlannedCell]) -> str:
@@ -310,9 +278,7 @@ def without_kernels(plan: Sequence[PlannedCell]) -> str:
 def expected_use(plan: Sequence[PlannedCell], past: int) -> str:
     """Return a line on the memory and the disk that the cells will take; empty if unknown.
 
-    Args:
-        plan: All cells, with their costs.
-        past: Number of finished cells that the estimates are from.
+    The estimates are from `past` finished cells.
     """
     costs = [cell.cost for cell in left_to_train(plan) if cell.cost]
     if not costs:

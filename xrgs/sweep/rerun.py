@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import math
 from dataclasses import dataclass
-from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +23,7 @@ from xrgs.safeio.hashing import file_digest
 from xrgs.safeio.sanitize import for_line
 from xrgs.splat.backend import resolve_backend
 from xrgs.store import provenance
-from xrgs.store.attempts import begin_attempt, plan_cell
+from xrgs.store.attempts import begin_attempt, free_name, plan_cell
 from xrgs.store.cell_folder import CellFolder
 from xrgs.store.identity import cell_identity
 from xrgs.store.store import Store
@@ -53,7 +52,6 @@ class RerunResult:
     """The comparison of a cell with the same cell trained again."""
 
     folder: CellFolder
-    """The folder of the cell that was trained again."""
     before: list[str]
     """Differences of code, libraries and machine, known before the training."""
     differences: list[str]
@@ -91,9 +89,6 @@ def rerun(
         plugins: Names of the components of other packages that may be imported. A cell that needs
             another one is refused: a store must not decide which code is imported.
 
-    Returns:
-        The comparison.
-
     Raises:
         XrgsError: The folder has no finished cell, or a config with unknown keys; the variant is
             missing and can't be built again; or the training failed.
@@ -102,7 +97,13 @@ def rerun(
     try:
         conf, added = _read(original)
         _check_plugins_allowed(original, conf, plugins)
-        home = Store(store or _store_of(folder))
+        cells = folder.absolute().parent  # not resolved: `cells` may be a link to another disk
+        if store is None and cells.name != "cells":
+            raise XrgsError(
+                f"rerun={folder} is not in a store; name the store that has its variant with"
+                " store=..."
+            )
+        home = Store(store or cells.parent)
         conf.threads = original.provenance().threads if threads is None else threads
         conf.scene.path = photographs or conf.scene.path
         if conf.threads < 0:
@@ -180,22 +181,8 @@ def _changes(then: Any, now: Any, name: str) -> Iterator[str]:
         yield f"{name}: {before} -> {after}"
 
 
-def _store_of(folder: Path) -> Path:
-    cells = folder.absolute().parent  # not resolved: `cells` may be a link to another disk
-    if cells.name != "cells":
-        raise XrgsError(
-            f"rerun={folder} is not in a store; name the store that has its variant with store=..."
-        )
-    return cells.parent
-
-
 def _provide(variant_id: str, conf: Conf, store: Store) -> None:
-    """Make sure that the variant is in the store.
-
-    Raises:
-        XrgsError: It is not, and building it again gives another variant; or its images were
-            removed on purpose, and can't be made again.
-    """
+    """Make sure that the variant is in the store; build it, or make its images, again."""
     job.restore_images(conf, store, variant_id)
     if (store.variants / variant_id).is_dir():
         return
@@ -220,15 +207,9 @@ def _provide(variant_id: str, conf: Conf, store: Store) -> None:
 
 
 def _free_folder(out: Path | None, folder: Path) -> Path:
-    """Return the folder to write to, which does not exist, in one that does.
-
-    Raises:
-        XrgsError: `out` exists.
-    """
+    """Return the folder to write to, which does not exist, in one that does."""
     if out is None:
-        beside = folder.absolute()
-        names = (beside.with_name(f"{beside.name}.rerun-{number}") for number in count(1))
-        return next(name for name in names if not name.exists())
+        return free_name(folder.absolute(), "rerun")
     if out.exists():
         raise XrgsError(f"out={out} exists already")
     out.absolute().parent.mkdir(parents=True, exist_ok=True)
@@ -262,18 +243,16 @@ def _differences(original: CellFolder, repeated: CellFolder) -> Iterator[str]:
     """Yield the differences of two cells' results, scores first."""
     yield from _score_differences(original, repeated)
     for name in _COUNTS:
-        then, now = (getattr(cell.summary(), name) for cell in (original, repeated))
-        if then != now:
-            yield f"{name}: {_number(then)} -> {_number(now)}"
+        values = [getattr(cell.summary(), name) for cell in (original, repeated)]
+        if values[0] != values[1]:
+            shown = [f"{value:,}" if isinstance(value, int) else str(value) for value in values]
+            yield f"{name}: {' -> '.join(shown)}"
     trimmed = original.status().trimmed
     for name in _RESULTS:
-        if name in trimmed:
-            then = trimmed[name].sha256
-        elif (original.path / name).is_file():
-            then = file_digest(original.path / name)
-        else:
+        if name not in trimmed and not (original.path / name).is_file():
             yield f"{name}: missing in {original.path}"
             continue
+        then = trimmed[name].sha256 if name in trimmed else file_digest(original.path / name)
         if then not in _digests(repeated.path / name):
             yield f"{name}: the bytes differ"
 
@@ -310,10 +289,6 @@ def _score_differences(original: CellFolder, repeated: CellFolder) -> Iterator[s
 def _scores(cell: CellFolder) -> dict[tuple[str, str], float]:
     """Return the scores by view and metric, NaN where one is missing."""
     return {(view, name): value for view, row in cell.view_scores() for name, value in row.items()}
-
-
-def _number(value: object) -> str:
-    return f"{value:,}" if isinstance(value, int) else str(value)
 
 
 def _listed(lines: list[str], title: str) -> list[str]:

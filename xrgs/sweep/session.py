@@ -31,14 +31,6 @@ class SweepSession:
         """Whether the folder is there and belongs to a call."""
         return (self.folder / "sweep").is_file()
 
-    def begin(self) -> None:
-        """Sign the folder with this process.
-
-        Raises:
-            OSError: The folder can't be written, or belongs to another call.
-        """
-        lease.sign(self.folder / "sweep")
-
     def stop(self, reason: str) -> None:
         """Let no further job begin; keep the reason, unless an earlier one is there."""
         # A full disk may have room for the file's name and none for the reason in it.

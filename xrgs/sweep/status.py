@@ -49,8 +49,8 @@ class StoreStatus:
     """Number of folders of earlier attempts that were set aside, and of reruns."""
     variants: tuple[str, ...]
     """Ids of the frozen variants."""
-    failed_scenes: tuple[tuple[str, str, str], ...]
-    """Scenes without a variant because SfM failed: the variant's key, the scene, and the reason."""
+    failed_scenes: tuple[str, ...]
+    """A line for each scene without a variant because SfM failed: the variant's key, and why."""
     sweeps: int
     """Number of recorded sweeps."""
     sizes: Mapping[str, int | None]
@@ -65,9 +65,6 @@ def read(path: Path) -> StoreStatus:
     The cells' files are checked by their sizes only. A file that can't be read is named among the
     problems, and does not hide the rest.
 
-    Args:
-        path: The store's folder.
-
     Raises:
         StoreError: There is no such store, or it can't be read now.
     """
@@ -81,7 +78,7 @@ def read(path: Path) -> StoreStatus:
         cells=tuple(cells),
         aside=_aside(store, problems),
         variants=tuple(problems.note_error(lambda: _variants(store, problems)) or []),
-        failed_scenes=tuple(problems.note_error(lambda: _failed_scenes(store)) or []),
+        failed_scenes=tuple(problems.note_error(partial(_failed_scenes, store)) or []),
         sweeps=len(records) + len(damaged),
         sizes=_sizes(store, problems),
         problems=tuple(problems),
@@ -118,10 +115,10 @@ def _variants(store: Store, problems: _Problems) -> list[str]:
     return [name for name in names if name in folders]
 
 
-def _failed_scenes(store: Store) -> list[tuple[str, str, str]]:
+def _failed_scenes(store: Store) -> list[str]:
     if not list_folder(store.variants):
         return []
-    return [(key, *why) for key, why in failed_scenes(store.variants).items()]
+    return ["  ".join((key, *why)) for key, why in failed_scenes(store.variants).items()]
 
 
 def _sizes(store: Store, problems: _Problems) -> dict[str, int | None]:
@@ -147,7 +144,7 @@ def describe(status: StoreStatus) -> str:
     for state in ("running", "failed", "corrupt", "unfinished"):
         of_state = [cell for cell in status.cells if cell.state.name == state]
         lines += _named(f"{state}:", [_reason(cell) for cell in of_state])
-    failed = [f"{key}  {scene}  {why}" for key, scene, why in status.failed_scenes]
+    failed = status.failed_scenes
     lines += _named("failed scenes, not tried again; retry=failed tries them again", failed)
     lines += TO_TRY if failed else ()
     changed = Counter(part for cell in stale for part in cell.stale)
@@ -181,21 +178,11 @@ def _table(cells: Sequence[CellRow]) -> list[str]:
 def _reason(cell: CellRow) -> str:
     # The latest of the sweeps that have a running cell is the one that trains it now.
     sweep = f"  sweep {cell.sweeps[-1]}" if cell.state.name == "running" and cell.sweeps else ""
-    return f"{cell.name}{sweep}  {_first_line(cell.state.reason)}"
-
-
-def _first_line(text: str) -> str:
-    return text.partition("\n")[0]
+    return f"{cell.name}{sweep}  {cell.state.reason.partition(chr(10))[0]}"
 
 
 def _named(heading: str, names: Sequence[str], command: str = "") -> list[str]:
-    """Return a heading with the first names below it; nothing where there are none.
-
-    Args:
-        heading: The line above.
-        names: The names.
-        command: What lists all of them.
-    """
+    """Return a heading with the first names below it; `command` lists all of them."""
     if not names:
         return []
     left = len(names) - _MAX_NAMED
@@ -204,11 +191,7 @@ def _named(heading: str, names: Sequence[str], command: str = "") -> list[str]:
 
 
 def watch(path: Path) -> None:
-    """Show the cells that are in training until Ctrl-C, on a terminal in place. It only reads.
-
-    Raises:
-        StoreError: There is no such store, or it can't be read now.
-    """
+    """Show the cells in training until Ctrl-C, on a terminal in place; raises as `read`."""
     store, drawn, pause = Store(path), 0, _WATCH_S
     store.check_exists()
     with suppress(KeyboardInterrupt):
@@ -225,16 +208,13 @@ def watch(path: Path) -> None:
 
 
 def running(store: Store) -> str:
-    """Return lines for `watch`: the time, the running sweeps, and the progress of their cells.
-
-    Raises:
-        StoreError: The store can't be read now.
-    """
+    """Return lines for `watch`: the time, the running sweeps, and the progress of their cells."""
     records, _ = store.records()
-    training = {}
-    for cell_id in lease.holders(store.leases):
-        if cell_progress := progress.read(store.cell(cell_id).progress):
-            training[cell_id] = cell_progress
+    training = {
+        cell_id: now
+        for cell_id in lease.holders(store.leases)
+        if (now := progress.read(store.cell(cell_id).progress))
+    }
     lines = [f"{time.strftime('%H:%M:%S')}  {counted(len(training), 'cell')} in training"]
     # A cell of several sweeps is trained by the latest one.
     sweeps = {row.cell_id: name for name, record in records.items() for row in record.cells}

@@ -46,6 +46,7 @@ from xrgs.splat.backend import resolve_backend
 from xrgs.store.attempts import plan_cell
 from xrgs.store.store import Store, StoreGoneError
 from xrgs.sweep import controls, launchers, track
+from xrgs.sweep import plan as plans
 from xrgs.sweep.axes import CellSpec, effective, expand
 from xrgs.sweep.ending import ending
 from xrgs.sweep.estimate import CostEstimator
@@ -59,24 +60,7 @@ from xrgs.sweep.job import (
     unwritable,
 )
 from xrgs.sweep.monitor import SweepMonitor
-from xrgs.sweep.plan import (
-    PlannedCell,
-    check_sizes,
-    describe,
-    estimated,
-    expected_length,
-    expected_use,
-    identified,
-    left_to_train,
-    planned,
-    ready,
-    record,
-    unchanged,
-    will_fail,
-    with_variants,
-    with_wanted_baselines,
-    without_kernels,
-)
+from xrgs.sweep.plan import PlannedCell
 from xrgs.sweep.session import SweepSession
 
 if TYPE_CHECKING:
@@ -103,21 +87,9 @@ class Study:
     """One call of `xrgs-sweep`."""
 
     def __init__(
-        self,
-        context: HydraContext,
-        task: TaskFunction,
-        config: DictConfig,
-        *,
-        brief: bool = False,
+        self, context: HydraContext, task: TaskFunction, config: DictConfig, *, brief: bool = False
     ) -> None:
-        """Keep what Hydra gives its sweeper.
-
-        Args:
-            context: Hydra's context of this call.
-            task: The function that Hydra's launcher calls for each job.
-            config: The config composed from the command line, with its `hydra` node.
-            brief: Print only progress and failures, no plan, notes and tables.
-        """
+        """Keep what Hydra gives its sweeper; `brief` prints only progress and failures."""
         self._brief = brief
         self._context = context
         self._task = task
@@ -130,8 +102,7 @@ class Study:
     def run(self, arguments: Sequence[str]) -> None:
         """Plan the cells, build their variants, train unfinished cells, record and report.
 
-        Args:
-            arguments: Hydra overrides, with the axes among them.
+        The arguments are Hydra overrides, with the axes among them.
 
         Raises:
             CompactHydraException: The user can correct the problem; Hydra prints only the message.
@@ -160,12 +131,7 @@ class Study:
         raise error
 
     def _plan_and_train(self, arguments: Sequence[str]) -> bool:
-        """Return whether every cell is done; after a dry run, whether none is known to fail.
-
-        Raises:
-            StoreError: The store can't be written, or is no longer there.
-            XrgsError: A value of a cell's config is out of its range.
-        """
+        """Return whether every cell is done; after a dry run, whether none is known to fail."""
         launchers.check(self._config)
         arguments = effective(arguments)
         plan = self._plan(arguments)
@@ -173,30 +139,35 @@ class Study:
         store = Store(Path(plan[0].conf.store))
         dry_run = plan[0].conf.dry_run
         if dry_run:
-            store.check_writable()
+            store.check_room()
         else:
             store.prepare()
             self._store = store
-        plan, notes = with_variants(plan, store, allow_build=not dry_run)
+        plan, notes = plans.with_variants(plan, store, allow_build=not dry_run)
         for line in () if self._brief else notes:
             log_line(line)
         plan = self._identified(plan, store)
-        past = CostEstimator(store)
-        plan = estimated(plan, past, self._threads(len(plan)))
+        past, machine = CostEstimator(store), usable_cores()
+        capacity = launchers.capacity(self._config.hydra.launcher, 0, machine)
+        plan = plans.estimated(plan, past, capacity.threads(len(plan), machine) or machine)
         if not self._brief:
-            self._say_plan(plan, past.known)
-        if any(left_to_train(plan)) and (plan[0].conf.lpips.fetch or not self._brief):
+            say(plans.describe(plan), sys.stderr)
+            remarks = (*controls.mixed_prune_rules(plan), *plans.unchanged(plan))
+            use = plans.expected_use(plan, past.known)
+            for line in filter(None, (*remarks, plans.without_kernels(plan), use)):
+                log_line(line)
+        if any(plans.left_to_train(plan)) and (plan[0].conf.lpips.fetch or not self._brief):
             provide_lpips(fetch=plan[0].conf.lpips.fetch, dry_run=dry_run)
         if dry_run:
-            return not will_fail(plan)
+            return not plans.will_fail(plan)
         _tidy({cell.cell_id for cell in plan if cell.cell_id and cell.state.name == "done"}, store)
         # At the start, so that a report can be made while it runs, and after it was stopped.
-        sweep_id = store.write_sweep(arguments, record(plan))
+        sweep_id = store.write_sweep(arguments, plans.record(plan))
         with track.Tracker(plan[0].conf.track, store) as tracker:
             with SweepMonitor(store.cells_folder, brief=self._brief) as monitor:
                 plan = self._run_until_complete(plan, store, [monitor, tracker])
             plan = [_without_reference(cell) for cell in plan]
-            store.write_sweep(arguments, record(plan), sweep_id)
+            store.write_sweep(arguments, plans.record(plan), sweep_id)
             from xrgs.report import build
 
             report = build(store.path, sweep_id)
@@ -204,21 +175,8 @@ class Study:
                 say(f"{report.text}\n\n{ending(plan, store.path)}".rstrip())
         complete = all(cell.error is None and cell.state.name == "done" for cell in plan)
         if self._brief and not complete:
-            say(describe(plan), sys.stderr)
+            say(plans.describe(plan), sys.stderr)
         return complete
-
-    @staticmethod
-    def _say_plan(plan: Sequence[PlannedCell], past: int) -> None:
-        """Say what the sweep will do, with estimates from `past` finished cells."""
-        say(describe(plan), sys.stderr)
-        remarks = (*controls.mixed_prune_rules(plan), *unchanged(plan), without_kernels(plan))
-        for line in filter(None, (*remarks, expected_use(plan, past))):
-            log_line(line)
-
-    def _threads(self, cells: int) -> int:
-        """Return the threads of a cell whose config sets no number of threads."""
-        launcher, machine = self._config.hydra.launcher, usable_cores()
-        return launchers.capacity(launcher, 0, machine).threads(cells, machine) or machine
 
     def _run_until_complete(
         self,
@@ -226,11 +184,7 @@ class Study:
         store: Store,
         watchers: Sequence[SweepMonitor | track.Tracker],
     ) -> list[PlannedCell]:
-        """Launch cells until none is left to do, here or in another sweep; return the final plan.
-
-        Raises:
-            StoreError: The store can't be written any more, or is no longer there.
-        """
+        """Launch cells until none is left to do, here or in another sweep; return the last plan."""
         conf = plan[0].conf
         waiting_said, tried = False, set[str]()
         launches = Launches(self._context, self._task, self._config)
@@ -238,14 +192,13 @@ class Study:
             store.check_not_gone()
             for watcher in watchers:
                 watcher.watch(plan)
-            to_train = ready(plan, tried, retry=conf.retry == "failed")
+            to_train = plans.ready(plan, tried, retry=conf.retry == "failed")
             elsewhere = [cell for cell in plan if cell.state.name == "running"]
             if not to_train and not elsewhere:
                 launches.end()
                 return list(plan)
             outcomes = launches.launch(to_train.values(), store) if to_train else {}
-            not_begun = {LOCKED, LOST}
-            begun = {cell_id for cell_id in to_train if outcomes[cell_id] not in not_begun}
+            begun = {i for i, outcome in outcomes.items() if outcome not in {LOCKED, LOST}}
             tried |= begun
             store.check_not_gone()
             plan = self._identified(plan, store)
@@ -264,24 +217,19 @@ class Study:
                 time.sleep(_POLL_S)
 
     def _plan(self, arguments: Sequence[str]) -> list[PlannedCell]:
-        """Return every cell of the command line; references come before count-matched cells.
-
-        Raises:
-            XrgsError: `matched_to` has no effect, or names a cell that is count-matched itself;
-                or `baseline=false` leaves no cell.
-        """
+        """Return every cell of the command line; references come before count-matched cells."""
         plan: dict[CellSpec, PlannedCell] = {}
         combinations = expand(arguments, self._context.config_loader)
         for spec in dict.fromkeys(map(self._with_effective_match, combinations)):
-            cell = planned(spec, self._compose(spec))
+            cell = plans.planned(spec, self._compose(spec))
             if cell.reference is not None:
-                reference = planned(cell.reference, self._compose(cell.reference))
+                reference = plans.planned(cell.reference, self._compose(cell.reference))
                 controls.check_reference(cell, reference)
                 plan.setdefault(cell.reference, reference)
             plan.setdefault(cell.spec, cell)
         controls.check_effect(combinations, plan.values())
         scenes.check_labels(cell.conf.scene for cell in plan.values())
-        return with_wanted_baselines(list(plan.values()))
+        return plans.with_wanted_baselines(list(plan.values()))
 
     def _with_effective_match(self, spec: CellSpec) -> CellSpec:
         """Drop `matched_to` unless the ablation is count-matched."""
@@ -295,7 +243,7 @@ class Study:
         cells: dict[CellSpec, PlannedCell] = {}
         holders = lease.holders(store.leases)
         for earlier in plan:
-            cell = identified(self._with_count(earlier, cells, store), store, holders)
+            cell = plans.identified(self._with_count(earlier, cells, store), store, holders)
             cells[cell.spec] = cell
         return list(cells.values())
 
@@ -319,7 +267,7 @@ class Study:
         overrides = tuple(spec.overrides)
         if overrides not in self._confs:
             conf = to_conf(self._hydra_config(overrides))
-            check_sizes(conf)
+            plans.check_sizes(conf)
             self._confs[overrides] = conf
         return self._confs[overrides]
 
@@ -341,10 +289,9 @@ class Study:
 
 
 class Launches:
-    """The launches of one call of `xrgs-sweep`."""
+    """The launches of one call of `xrgs-sweep`; nothing is written before the first."""
 
     def __init__(self, context: HydraContext, task: TaskFunction, config: DictConfig) -> None:
-        """Prepare to launch, as `Study`; nothing is written before the first launch."""
         self._name = str(config.hydra.runtime.choices["hydra/launcher"])
         loader = cast("ConfigLoader", _JobConfigLoader())  # launchers call no other method
         self._context = HydraContext(loader, context.callbacks)
@@ -359,18 +306,17 @@ class Launches:
         """Create the session's folder, and give its full path to every job."""
         folder = _create_unique(user_path(self._config.hydra.sweep.dir).absolute(), store)
         self._set("sweep.dir", escape_interpolations(str(folder)))
-        session = SweepSession(folder)
-        session.begin()
-        return session
+        lease.sign(folder / "sweep")
+        return SweepSession(folder)
+
+    def _set(self, key: str, value: Any) -> None:
+        with flag_override(self._config.hydra, ["readonly", "struct"], False):
+            OmegaConf.update(self._config.hydra, key, value)
 
     def end(self) -> None:
         """Tidy up after the last launch, whose jobs have all ended."""
         if self._session is not None:
             self._session.end()
-
-    def _set(self, key: str, value: Any) -> None:
-        with flag_override(self._config.hydra, ["readonly", "struct"], False):
-            OmegaConf.update(self._config.hydra, key, value)
 
     @property
     def stopped(self) -> str:
@@ -388,7 +334,7 @@ class Launches:
             XrgsError: The launcher can't be used, or begins no job; or the store is gone.
         """
         self._session = session = self._session or self._begin(store)
-        cells = sorted(cells, key=expected_length, reverse=True)
+        cells = sorted(cells, key=plans.expected_length, reverse=True)
         threads, machine = max(cell.conf.threads for cell in cells), usable_cores()
         launcher = self._config.hydra.launcher
         allowed = launchers.capacity(launcher, threads, machine)
@@ -396,22 +342,17 @@ class Launches:
             allowed = launchers.one_cell_a_gpu(launcher, allowed, len(gpus()))
         for key, value in allowed.settings.items():
             self._set(f"launcher.{key}", value)
-        outcomes: dict[str, str] = {}
+        outcomes = {str(cell.cell_id): STOPPED for cell in cells}
         for batch in self._batches(cells, allowed.batch or len(cells)):
-            if session.stopped:
-                outcomes |= {str(cell.cell_id): STOPPED for cell in batch}
-                continue
-            outcomes |= self._launch_batch(batch, allowed.threads(len(batch), machine), store)
+            if not session.stopped:
+                outcomes |= self._launch_batch(batch, allowed.threads(len(batch), machine), store)
         return outcomes
 
     def _batches(self, cells: Sequence[PlannedCell], size: int) -> list[Sequence[PlannedCell]]:
         """Divide cells into batches. Cells that may have broken a launcher come last, one each."""
         others = [cell for cell in cells if cell.cell_id not in self._suspects]
-        suspects = [cell for cell in cells if cell.cell_id in self._suspects]
-        return [
-            *(others[start : start + size] for start in range(0, len(others), size)),
-            *([cell] for cell in suspects),
-        ]
+        batches = [others[start : start + size] for start in range(0, len(others), size)]
+        return [*batches, *([cell] for cell in cells if cell.cell_id in self._suspects)]
 
     def _launch_batch(
         self, cells: Sequence[PlannedCell], threads: int, store: Store
@@ -451,7 +392,7 @@ class Launches:
         state = store.cell(str(cell.cell_id)).state().name
         if state == "unfinished":
             return self._after_silence(str(cell.cell_id), state)
-        return "done" if state == "done" else "failed"
+        return state if state == "done" else "failed"
 
     def _after_silence(self, cell_id: str, state: str) -> str:
         """Return the outcome of a job without an answer, from the state of its cell."""
@@ -494,13 +435,9 @@ class _JobConfigLoader:
     """
 
     def load_sweep_config(self, master_config: DictConfig, overrides: list[str]) -> DictConfig:
-        """Return the sweep's `hydra` node with `cell` (its id), `store` and `name` of one job.
-
-        Raises:
-            XrgsError: The session's folder is no longer there. Hydra would make it again.
-        """
+        """Return the sweep's `hydra` node with `cell` (its id), `store` and `name` of one job."""
         folder = master_config.hydra.sweep.dir
-        if not SweepSession(Path(folder)).exists:
+        if not SweepSession(Path(folder)).exists:  # Hydra would make it again
             raise XrgsError(f"hydra.sweep.dir={folder} is no longer there")
         config = OmegaConf.masked_copy(master_config, ["hydra"])
         with flag_override(config, ["readonly", "struct"], False):
@@ -572,12 +509,7 @@ def _hand_over(cell: PlannedCell, threads: int, store: Store) -> list[str]:
 def provide_lpips(*, fetch: bool, dry_run: bool) -> None:
     """Fetch the weights of LPIPS where this machine has none, or say that LPIPS will be n/a.
 
-    Args:
-        fetch: `lpips.fetch`: whether they may be fetched.
-        dry_run: Only say what would be done.
-
-    Raises:
-        WeightsError: XRGS_LPIPS is set and names no file.
+    They are fetched where `lpips.fetch` allows it, and not in a dry run.
     """
     if weights.find_weights() is not None:
         return

@@ -17,10 +17,11 @@ from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.photos import scenes
 from xrgs.runtime.progress import log_line
 from xrgs.safeio.records import as_number, read_table
+from xrgs.store.listing import modified
 from xrgs.sweep.trackers import SINKS, Curves, Run, mlflow_uri
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Sequence
     from pathlib import Path
 
     from xrgs.store.cell_folder import CellFolder
@@ -30,10 +31,8 @@ if TYPE_CHECKING:
 
 #: The folder of a store for tracking; each kind has a folder in it.
 FOLDER = "tracking"
-#: The values of `track`.
+#: The values of `track`. A kind but the first two needs the package and the extra of its name.
 KINDS = ("none", *SINKS)
-#: The package that a kind needs; the extra has the kind's name.
-_PACKAGES = {"tensorboard": "tensorboard", "mlflow": "mlflow", "wandb": "wandb"}
 #: Seconds between two looks at the cells, and from a failure to the next look.
 _POLL_S, _PAUSE_S = 2.0, 30.0
 #: Seconds that the end of a sweep waits for a tracker, for example for a server that is away.
@@ -41,24 +40,18 @@ _END_S = 60.0
 
 
 def check(kind: str) -> None:
-    """Check, before anything is trained, that cells can be tracked with this value of `track`.
-
-    Raises:
-        XrgsError: There is no such kind, or its package is not installed.
-    """
+    """Check, before anything is trained, that cells can be tracked with this value of `track`."""
     if kind not in KINDS:
         raise XrgsError(f"track={kind}: must be one of {', '.join(KINDS)}")
-    if kind in _PACKAGES and find_spec(_PACKAGES[kind]) is None:
+    if kind not in KINDS[:2] and find_spec(kind) is None:
         raise XrgsError(f"track={kind}: it is not installed: pip install 'xrgs[{kind}]'")
 
 
 def curves(cell: CellFolder, *, done: bool) -> Curves:
     """Read the curves that a cell has written so far.
 
-    Args:
-        cell: The cell, which has written its first row.
-        done: Whether the cell is done. Otherwise the curves end with the last row of the history:
-            scores of later steps may not be complete.
+    Unless the cell is done, they end with the last row of the history: scores of later steps may
+    not be complete.
 
     Raises:
         StoreError: A file can't be read; the message names it.
@@ -68,7 +61,11 @@ def curves(cell: CellFolder, *, done: bool) -> Curves:
     quality = cell.path / "quality.csv"
     rows = [*history, *(_table(quality, "quality") if quality.is_file() else ())]
     if done:
-        rows.append(_scores(cell))
+        from xrgs.store.results import cell_metrics  # pandas is slow to load
+
+        summary = cell.summary()
+        scores = cell_metrics(summary, cell.scores())
+        rows.append((summary.steps, {f"score/{name}": score for name, score in scores.items()}))
     else:
         rows = [(step, values) for step, values in rows if step <= history[-1][0]]
     by_step: Curves = {}
@@ -87,15 +84,6 @@ def _table(file: Path, group: str) -> list[tuple[int, dict[str, float]]]:
         (int(row["step"]), {f"{group}/{name}": as_number(row[name]) for name in others})
         for row in table
     ]
-
-
-def _scores(cell: CellFolder) -> tuple[int, dict[str, float]]:
-    """Return the number of steps of a finished cell, and its scores."""
-    from xrgs.store.results import cell_metrics  # pandas is slow to load
-
-    summary = cell.summary()
-    metrics = cell_metrics(summary, cell.scores())
-    return summary.steps, {f"score/{name}": value for name, value in metrics.items()}
 
 
 def run_of(planned: PlannedCell, cell: CellFolder) -> Run:
@@ -137,7 +125,8 @@ class _Followed:
             Exception: Whatever a package, a server or a disk raises. The next call asks the
                 tracker for its last step, and goes on from there.
         """
-        written = () if self.ended else tuple(self._written())
+        names = () if self.ended else ("history.csv", "status.json")
+        written = tuple(when for name in names if (when := modified(self.cell.path / name)))
         if not written or written == self._seen:
             return
         state = self.cell.state(verify=False).name
@@ -150,26 +139,17 @@ class _Followed:
                 log_line(f"{self.cell.id}: it is not tracked: {error}")
             return
         try:
-            self._send(by_step, kind, folder)
+            if self._sink is None:
+                self._sink = SINKS[kind](run_of(self._planned, self.cell), folder)
+            if new := {step: by_step[step] for step in by_step if step > self._sink.sent}:
+                self._sink.send(new)
+                self._sink.sent = max(new)
             if state in {"done", "failed"}:
                 self.close(state)
         except BaseException:
             self._sink = None  # the next one reads its last step anew
             raise
         self._seen, self.ended = written, state == "done"
-
-    def _written(self) -> Iterator[float]:
-        for name in ("history.csv", "status.json"):
-            with suppress(OSError):
-                yield (self.cell.path / name).stat().st_mtime_ns
-
-    def _send(self, by_step: Curves, kind: str, folder: Path) -> None:
-        if self._sink is None:
-            self._sink = SINKS[kind](run_of(self._planned, self.cell), folder)
-        new = {step: by_step[step] for step in by_step if step > self._sink.sent}
-        if new:
-            self._sink.send(new)
-            self._sink.sent = max(new)
 
     def close(self, state: str) -> None:
         """End the run of a cell that is `done`, `failed` or `stopped`."""

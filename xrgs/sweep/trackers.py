@@ -170,18 +170,15 @@ class _MLflow(Sink):
         client.update_run(self._id, status="RUNNING")
 
     def _create(self, experiment: str, run: Run) -> str:
-        tags = {key: for_line(str(value)) for key, value in run.names.items()}
-        tags["cell_id"] = run.cell_id
-        info = self._client.create_run(experiment, tags=tags, run_name=run.name).info
-        self._log_config(info.run_id, run.config)
-        return str(info.run_id)
-
-    def _log_config(self, run_id: str, config: Mapping[str, str | float]) -> None:
         from mlflow.entities import Param
 
-        params = [Param(key, str(value)) for key, value in config.items()]
+        tags = {key: for_line(str(value)) for key, value in run.names.items()}
+        tags["cell_id"] = run.cell_id
+        run_id = str(self._client.create_run(experiment, tags=tags, run_name=run.name).info.run_id)
+        params = [Param(key, str(value)) for key, value in run.config.items()]
         for at in range(0, len(params), _MAX_PARAMS):
             self._client.log_batch(run_id, params=params[at : at + _MAX_PARAMS])
+        return run_id
 
     def send(self, new: Curves) -> None:
         from mlflow.entities import Metric
