@@ -38,7 +38,7 @@ RECIPES: dict[str, str] = dict(
         re.MULTILINE | re.DOTALL,
     )
 )
-SMOKE = ("scene=motorcycle", "preset=smoke", "train.steps=8", "threads=1", "store=s")
+SMOKE = ("scene=motorcycle", "preset=smoke", "threads=1", "store=s")
 
 
 @dataclass(frozen=True)

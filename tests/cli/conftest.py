@@ -143,10 +143,13 @@ def children(monkeypatch: pytest.MonkeyPatch) -> Children:
 
 
 @pytest.fixture(scope="session")
-def swept(forked_command: RunCommand, made_once: Callable[..., Path]) -> tuple[Path, str]:
+def swept(
+    forked_command: RunCommand, made_once: Callable[..., Path], smoke_variants: Path
+) -> tuple[Path, str]:
     """A folder with a finished smoke sweep in its store `s`, and what was printed."""
 
     def sweep_once(folder: Path) -> None:
+        shutil.copytree(smoke_variants, folder / "s" / "variants")
         code, out, err = forked_command("sweep", folder, "+ablation=consistency", *SMOKE, "store=s")
         assert code == 0, err
         (folder / "printed").write_text(out, encoding="utf-8")

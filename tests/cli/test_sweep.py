@@ -153,7 +153,6 @@ def test_a_value_that_changes_a_number_is_another_cell(
     code, _, err = sweep_here(*arguments)
     assert code == 0, err
     for changes, done in (
-        (["train.steps=9"], 0),
         (["components.loss_weighting.lr_weight=0.5"], 1),  # the baseline has no component
         (["threads=1", "data_root=x", "scene.name=y", "store=./s", "checkpoint_s=7"], 2),
     ):

@@ -1,33 +1,13 @@
 """Changes of each metric from a paired base, averaged by scene: the numbers of a report's tables.
 
-The base is the baseline, or any other label of the sweep. A pair is a cell and the base of the same
-scene, condition and replicate. A replicate is a value of `variant.seed`, which draws the HR views,
-and a value of `seed`, which training uses: both cells of a pair have the same variant and seed.
-
-PSNR is compared by its difference in dB. Every other metric is above zero and is compared by
-log(value / base), whose means and intervals become percent at the end: 100 (exp(mean) - 1). A
-scene's change is the mean over its replicates, and the sweep's change is the mean over scenes, in
-which each scene counts once.
+docs/statistics.md defines changes, intervals, tests, verdicts and the share of the gap to `all_hr`.
+A pair is a cell and the base of the same scene, condition and replicate (`variant.seed` and
+`seed`), so that both have the same variant and seed. The base is the baseline, or any other label
+of the sweep.
 
 Times are compared if both cells were trained on the same machine and number of threads from start
-to end. A score is compared if the same code has computed both values.
-
-The 95 % interval is Student's t around the mean. With several scenes it is over the scenes' means:
-it says how far the mean would move with other scenes like these, and includes the noise between
-replicates. The interval for a new scene says where the mean over the replicates of one more such
-scene would be. With one scene the interval is over replicates. One scene with one replicate has no
-interval.
-
-Verdicts are for the outcomes that a `Design` names, and all other metrics are descriptive. The p of
-the t-tests of the outcomes are corrected together, over all ablations of a condition. Amounts are
-corrected apart from scores: nearly every ablation changes an amount, and such tests would make room
-for false discoveries among the scores.
-
-A condition may have `all_hr`, which trains on the originals of the degraded photographs. Then a
-pair closes a share of the gap, in percent: 100 (value - base) / (all_hr - base), from the three
-cells of one scene and replicate. 0 is the base, and 100 is the quality with all information. The
-shares are averaged in the same way. They exist only for scores of views, since a gap in seconds or
-Gaussians means nothing, and only if all_hr is better than the base.
+to end. A score is compared if the same code has computed both values. Shares of the gap exist only
+for scores of views, since a gap in seconds or Gaussians means nothing.
 """
 
 from __future__ import annotations

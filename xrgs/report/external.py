@@ -2,9 +2,8 @@
 
 They are scored by the metrics of the frozen protocol against the photographs of the variant, and
 compared by the same statistics. They are 8-bit PNGs, while our own cells are scored as float32
-images: rounding to 8 bits costs 0.005 dB of PSNR at 30 dB and 0.05 dB at 40 dB, and 0.0004 of SSIM
-on the embedded scene. Time, Gaussians and memory come from `figures.json` beside the renders
-(`Figures`), else they are n/a.
+images; docs/report.md says what rounding costs. `figures.json` beside them may have time, Gaussians
+and memory (`Figures`).
 """
 
 from __future__ import annotations
