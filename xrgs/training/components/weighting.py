@@ -221,7 +221,7 @@ def scene_attenuation(views: Sequence[TrainingView], texture: float) -> float:
     low-frequency", without a measure or weights. Measure, ramp and threshold are ours. `texture` of
     0.07 is between g of the LLFF scenes that the paper calls cluttered (fern, flower, horns: 0.074
     to 0.12 at factor 5 of 504 and 1008 px) and of the simple ones (fortress 0.055; a single object
-    0.03 to 0.04). It is an intensity per px.
+    0.03 to 0.04). `texture` is an intensity per px.
     """
     magnitudes = [mean_gradient(v.image, v.mask) for v in views if v.tag == "LR"]
     mean = sum(magnitudes) / len(magnitudes) if magnitudes else 0.0
