@@ -134,18 +134,15 @@ def test_a_cell_killed_in_training_and_again_in_evaluation_goes_on(
 def test_a_cell_that_goes_on_elsewhere_names_both_machines(conf: Conf, tmp_path: Path) -> None:
     killed(conf, tmp_path, 6)
     several = ["threads 1", "threads 2"]
-    for conf.threads in (1, 2, 1):  # where it began, elsewhere, and there again
+    for conf.threads in (2, 1, 2):  # here, where it began, and here again
         folder = begin(conf, tmp_path)
         with pytest.MonkeyPatch.context() as patch:
             kill_at(patch, protocol, "score_views", 1)
             with pytest.raises(Kill):
                 cell.run_cell(conf, VARIANT, folder)
         found = folder.provenance().machines_in_turn.split("; ")
-        if found == [""]:
-            continue
         assert len(found) == 2
         assert all(word in name for word, name in zip(several, found, strict=True))
-    assert found != [""]
     # Where training starts over, the last machine is the only one.
     _truncate(folder.checkpoint, folder.checkpoint)
     folder = begin(conf, tmp_path)

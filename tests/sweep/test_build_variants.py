@@ -321,7 +321,7 @@ def photographs(folder: Path, count: int, size: tuple[int, int] = (120, 80)) -> 
         ),
         (5, (40, 30), {}, "0 photograph(s) can be used.*lower variant.factor to 2"),
         (
-            *(5, (120, 80), {"test": [1, 2, 3, 4]}),
+            *(5, (120, 80), {"test": ["1", "2", "3", "4"]}),
             "5 photographs are too few: 4 are held out.* or name fewer or others in variant.test",
         ),
     ],

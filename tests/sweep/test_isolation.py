@@ -167,11 +167,11 @@ def test_a_cell_that_hangs_is_ended_at_its_limit_and_fail_fast_starts_nothing_mo
     sweeps: Any,
 ) -> None:
     before = files(sweeps.cells()[2])
-    code, _, err = sweeps.run(*SMOKE, "seed=2,4,7", "limits.minutes=0.05", "fail_fast=true")
+    code, _, err = sweeps.run(*SMOKE, "seed=2,4,7", "limits.minutes=0.1", "fail_fast=true")
     assert code == 1
     assert (sweeps.folder / "hangs").exists()
-    assert "limits.minutes=0.05" in status(sweeps.cells()[4])["reason"]
-    assert "limits.minutes=0.05" in err
+    assert "limits.minutes=0.1" in status(sweeps.cells()[4])["reason"]
+    assert "limits.minutes=0.1" in err
     assert err.count("training cell") == 1
     assert 7 not in sweeps.cells()
     # What had failed is left as it was, for nobody has asked for another try.

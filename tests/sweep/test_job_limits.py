@@ -79,8 +79,8 @@ def test_a_process_that_hangs_is_killed_with_its_children_though_it_ignores_sigt
 ) -> None:
     monkeypatch.setattr(job, "_LIMIT_GRACE_S", 0.5)
     pids = tmp_path / "pids"
-    ended = job.run_supervised(python(_STUBBORN, str(pids)), limits(minutes=0.05))
-    assert "limits.minutes=0.05" in ended.reason
+    ended = job.run_supervised(python(_STUBBORN, str(pids)), limits(minutes=0.1))
+    assert "limits.minutes=0.1" in ended.reason
     for pid in json.loads(pids.read_text()):
         wait(partial(gone, pid))
 
