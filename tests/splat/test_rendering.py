@@ -47,7 +47,7 @@ def test_image_is_not_clamped_above(backend: str) -> None:
 
 def test_an_offset_of_zeros_changes_nothing_and_needs_no_memory(backend: str) -> None:
     plain = draw(backend=backend).image
-    gradients = []
+    gradients: list[Tensor] = []
     for offset in (zero_means2d_offset(6), torch.zeros(6, 2, requires_grad=True)):
         image = draw(backend=backend, means2d_offset=offset).image
         assert torch.equal(image, plain)
