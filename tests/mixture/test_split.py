@@ -156,6 +156,7 @@ def test_an_invalid_config_is_refused_by_its_key(
 
 
 def test_every_documented_limit_is_accepted(configured: Make) -> None:
+    change: dict[str, Any]
     for change in (
         {
             "factor": 1,

@@ -84,6 +84,7 @@ def test_numbers_are_read_and_anything_else_refused() -> None:
         assert as_number(value) == float(value)
     assert math.isnan(as_number(None))
     assert math.isnan(as_number(""))
+    wrong: object
     for wrong in (True, [], {}, "x", 10**400, 1.1e30, "-1.1e30"):
         with pytest.raises(ValueError):  # noqa: PT011 - float's own messages
             as_number(wrong)
