@@ -327,13 +327,15 @@ def test_values_that_no_cell_can_have_are_refused(compose: Callable[..., config.
             compose(override)
     assert config.TRAINING_VIEWS == USES
     conf = compose()
-    for message, changes in {
+    refused: dict[str, dict[str, Any]] = {
         "variant.factor=0: must be 1 or more": {"factor": 0},
         "variant.sfm.camera=two": {"sfm": replace(conf.variant.sfm, camera="two")},
         "variant.long_side=54: must be 0 .* or at least 55": {"long_side": 54},
-    }.items():
+    }
+    for message, changes in refused.items():
         with pytest.raises(XrgsError, match=message):
             plan_module.check_sizes(replace(conf, variant=replace(conf.variant, **changes)))
+    allowed: dict[str, Any]
     for allowed in ({"long_side": 0}, {"long_side": 55}, {"long_side": 22, "factor": 2}):
         plan_module.check_sizes(replace(conf, variant=replace(conf.variant, **allowed)))
 

@@ -209,10 +209,10 @@ def views_table(frozen: Variant, report: SfmReport) -> TextTable:
     columns = ("View", "Split", "Tag", "Size, px", "rho", "Placed")
     title = f"{frozen.scene}, variant {frozen.id}, factor {frozen.factor}"
     notes = tuple(_counts(frozen, tagless=report.tagless))
-    kept = [name for name in range(len(columns)) if not (report.tagless and columns[name] == "Tag")]
-    columns, *rows = (tuple(row[i] for i in kept) for row in (columns, *sorted(rows)))
+    kept = [i for i, name in enumerate(columns) if name != "Tag" or not report.tagless]
+    heads, *cells = (tuple(row[i] for i in kept) for row in (columns, *sorted(rows)))
     align = "".join("lllrrl"[i] for i in kept)
-    return TextTable(title, columns, tuple(rows), align, notes)
+    return TextTable(title, heads, tuple(cells), align, notes)
 
 
 def _counts(frozen: Variant, *, tagless: bool) -> Iterator[str]:

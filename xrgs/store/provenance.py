@@ -66,7 +66,8 @@ def collect(threads: int, backend: str) -> Provenance:
             can't be scored is better stopped here than after its training.
         XrgsError: The backend is not available on this machine.
     """
-    built_from, gpu = _commit(), None
+    built_from = _commit()
+    gpu: str | None = None
     if device(backend) == "cuda":
         import torch
 
