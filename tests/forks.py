@@ -24,6 +24,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TextIO
 
+from xrgs.config import LimitsConf
 from xrgs.sweep import job
 
 #: The module that is the child of a sweep.
@@ -73,7 +74,7 @@ class _Handler(socketserver.StreamRequestHandler):
 
         def run_supervised(
             command: Sequence[str],
-            limits: object,
+            limits: LimitsConf | None = None,
             on_poll: Callable[[int], None] = lambda _: None,
             environment: Mapping[str, str] = MappingProxyType({}),
         ) -> job.ProcessEnd:

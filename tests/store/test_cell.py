@@ -275,7 +275,9 @@ def test_the_progress_of_a_cell_has_its_gaussians_and_its_loss(
 ) -> None:
     seen = []
     monkeypatch.setattr(progress, "_FILE_S", 0.0)
-    monkeypatch.setattr(progress, "_write", lambda _, now: seen.append(now))
+    monkeypatch.setattr(
+        progress, "write_json", lambda _, state, **__: seen.append(progress.Progress(**state))
+    )
     folder = begin(conf, tmp_path / "shown")
     cell.run_cell(conf, VARIANT, folder)
     history = folder.history()

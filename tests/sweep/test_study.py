@@ -335,8 +335,12 @@ def test_values_that_no_cell_can_have_are_refused(compose: Callable[..., config.
     for message, changes in refused.items():
         with pytest.raises(XrgsError, match=message):
             plan_module.check_sizes(replace(conf, variant=replace(conf.variant, **changes)))
-    allowed: dict[str, Any]
-    for allowed in ({"long_side": 0}, {"long_side": 55}, {"long_side": 22, "factor": 2}):
+    fits: list[dict[str, Any]] = [
+        {"long_side": 0},
+        {"long_side": 55},
+        {"long_side": 22, "factor": 2},
+    ]
+    for allowed in fits:
         plan_module.check_sizes(replace(conf, variant=replace(conf.variant, **allowed)))
 
 
