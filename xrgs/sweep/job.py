@@ -554,8 +554,10 @@ def main(work: str, request: str, answer: str) -> None:
     try:
         given = read_struct(Path(request), dict[str, Any])
         result = Answer(_WORK[work](given))
+    except WorkError as error:
+        result = Answer(error=str(error), outcome=error.outcome)
     except XrgsError as error:
-        result = Answer(error=str(error), outcome=getattr(error, "outcome", "failed"))
+        result = Answer(error=str(error))
     except Exception as error:
         if "store" not in given or not Store(given["store"]).is_gone:  # the parent says so
             say(traceback.format_exc(), sys.stderr)
