@@ -120,6 +120,17 @@ def test_a_character_that_the_stream_lacks_is_a_number() -> None:
     assert stream.buffer.getvalue() == b"\xe9 \\u90e8 \\u2191\n"
 
 
+def test_a_line_is_one_write_so_that_no_other_thread_writes_into_it() -> None:
+    class Writes(io.StringIO):
+        def write(self, text: str) -> int:
+            writes.append(text)
+            return super().write(text)
+
+    writes = list[str]()
+    say("two words", Writes())
+    assert writes == ["two words\n"]
+
+
 def test_a_message_of_a_log_is_one_line_and_a_traceback_keeps_its_lines() -> None:
     script = (
         "import logging\n"

@@ -32,7 +32,8 @@ def say(text: str, stream: TextIO | None = None) -> None:
     encoding = stream.encoding or "utf-8"  # a stream in memory has none
     text = for_terminal(text).encode(encoding, "backslashreplace").decode(encoding)
     clear = "\r\x1b[K" if is_terminal(stream) else ""
-    print(f"{clear}{text}", file=stream, flush=True)
+    stream.write(f"{clear}{text}\n")  # at once: `print` could be cut by another thread's line
+    stream.flush()
 
 
 def redraw(text: str, above: int, terminal: TextIO) -> int:
@@ -85,7 +86,7 @@ class _WriteErrorsIgnored(io.FileIO):
 def guard_streams() -> None:
     """Give this process three standard streams, of which stdout and stderr never fail.
 
-    A stream that was closed at the start, as below some daemons, becomes /dev/null. Text to a
+    A stream that was closed at the start, as a daemon starts its children, becomes /dev/null. Text to a
     closed terminal, a pipe without a reader or a full disk is lost, and the work goes on.
 
     Every command calls this before it opens a file: a file gets the lowest free descriptor, and

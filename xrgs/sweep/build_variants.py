@@ -296,7 +296,7 @@ def _use_of_photographs(parts: split.Split, conf: VariantConf) -> str:
 
 
 def _check_held_out(names: Sequence[str], conf: Conf, notes: Iterable[str] = ()) -> None:
-    """Refuse a split with too few photographs to train on, or none to test, though all be placed.
+    """Refuse a split with too few photographs to train on, or none to test, even if SfM places all.
 
     The names are sorted; notes on the photographs are for the end of the message.
     """
