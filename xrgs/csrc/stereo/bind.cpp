@@ -4,10 +4,10 @@
 
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
-#include <nanobind/stl/vector.h>
 
 #include <cstdint>
 #include <limits>
+#include <string>
 #include <vector>
 
 #include "output_arrays.h"
@@ -29,10 +29,28 @@ bool has_shape(const Array& array, std::size_t first, std::size_t second) {
   return array.shape(0) == first && array.shape(1) == second;
 }
 
-void plane_sweep_costs(const std::vector<Image>& windows, const std::vector<Volume>& a,
-                       const std::vector<Vector>& b, const std::vector<Image>& images,
-                       const std::vector<Used>& used, Volume inverse_depths, int best, float noise,
-                       float nearest, OutVolume costs) {
+// Returns the arrays of a list, without conversion. nanobind's own conversion to a vector ends the
+// process where memory runs out. Throws TypeError.
+template <class Array>
+std::vector<Array> arrays_of(const nb::list& list, const char* name) {
+  std::vector<Array> arrays(list.size());
+  for (std::size_t i = 0; i < arrays.size(); ++i)
+    if (!nb::try_cast(list[i], arrays[i], false))
+      throw nb::type_error(("plane_sweep_costs: each of " + std::string(name) +
+                            " must be of its type and dimensions, contiguous, on the CPU")
+                               .c_str());
+  return arrays;
+}
+
+void plane_sweep_costs(const nb::list& window_list, const nb::list& a_list, const nb::list& b_list,
+                       const nb::list& image_list, const nb::list& used_list,
+                       Volume inverse_depths, int best, float noise, float nearest,
+                       OutVolume costs) {
+  const std::vector<Image> windows = arrays_of<Image>(window_list, "windows");
+  const std::vector<Volume> a = arrays_of<Volume>(a_list, "a");
+  const std::vector<Vector> b = arrays_of<Vector>(b_list, "b");
+  const std::vector<Image> images = arrays_of<Image>(image_list, "images");
+  const std::vector<Used> used = arrays_of<Used>(used_list, "used");
   const std::size_t count = a.size();
   if (windows.size() != 4 || count < 1 || b.size() != count || images.size() != count ||
       used.size() != count || best < 1)
@@ -106,9 +124,8 @@ void semiglobal_sums(Volume costs, float jump, float step, OutVolume sums) {
 }  // namespace
 
 void bind_stereo(nb::module_& m) {
-  m.def("plane_sweep_costs", &plane_sweep_costs, nb::arg("windows").noconvert(),
-        nb::arg("a").noconvert(), nb::arg("b").noconvert(), nb::arg("images").noconvert(),
-        nb::arg("used").noconvert(), nb::arg("inverse_depths").noconvert(), nb::arg("best"),
+  m.def("plane_sweep_costs", &plane_sweep_costs, nb::arg("windows"), nb::arg("a"), nb::arg("b"),
+        nb::arg("images"), nb::arg("used"), nb::arg("inverse_depths").noconvert(), nb::arg("best"),
         nb::arg("noise"), nb::arg("nearest"), nb::arg("costs").noconvert(),
         "Write how badly each pixel fits other views at each inverse depth: costs [D, h, w].");
   m.def("semiglobal_sums", &semiglobal_sums, nb::arg("costs").noconvert(), nb::arg("jump"),
