@@ -8,6 +8,7 @@ import importlib
 import io
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -18,9 +19,10 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from copy import deepcopy
-from dataclasses import dataclass, field
-from functools import cache, partial
+from dataclasses import asdict, dataclass, field
+from functools import cache, partial, reduce
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from operator import getitem
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -202,7 +204,7 @@ def _composed(overrides: tuple[str, ...], _environment: tuple[tuple[str, str], .
     return composing.compose(*overrides)
 
 
-def composed(*overrides: str) -> config.Conf:
+def composed_by_hydra(*overrides: str) -> config.Conf:
     """Compose a config as `composing.compose` does, but equal ones once: Hydra takes 0.1 s each.
 
     `preset=laptop` stands for the default preset: tests know gsplat's own learning rates.
@@ -211,6 +213,38 @@ def composed(*overrides: str) -> config.Conf:
         overrides = ("preset=laptop", *overrides)
     environment = sorted(item for item in os.environ.items() if item[0].startswith("XRGS_"))
     return deepcopy(_composed(overrides, tuple(environment)))
+
+
+#: An override with a number, a flag or a name, and keys from which `conf/` takes other values.
+_PLAIN = re.compile(r"([a-z]\w*(?:\.\w+)+|threads|checkpoint_s)=([-+\w.]+)")
+_TAKEN_FROM = frozenset({"splat.raster.background", "splat.densify.stop"})
+
+
+def composed(*overrides: str) -> config.Conf:
+    """Return `composed_by_hydra`, but set plain values in the config of the other words.
+
+    tests/test_config.py compares the two. Whatever is not plain, or wrong, is left to Hydra.
+    """
+    plain = [word for word in overrides if _PLAIN.fullmatch(word)]
+    try:
+        values = asdict(composed_by_hydra(*(word for word in overrides if word not in plain)))
+        for key, text in (word.split("=") for word in plain):
+            *groups, name = key.split(".")
+            group = reduce(getitem, groups, values)
+            group[name] = _value_like(group[name], text)
+            assert key not in _TAKEN_FROM
+        return composing.to_conf(values)  # type: ignore[arg-type]
+    except Exception:  # a value that another word needs, an unknown key, a wrong type
+        return composed_by_hydra(*overrides)
+
+
+def _value_like(old: Any, text: str) -> Any:
+    """Read the text of an override that has the type of the value in its place."""
+    new = yaml.safe_load(text)
+    if type(old) is float and type(new) is int:
+        return float(new)
+    assert type(new) is type(old)
+    return new
 
 
 @pytest.fixture(scope="session")
