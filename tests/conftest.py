@@ -101,7 +101,7 @@ def _hydra_reads_equal_text_once() -> Iterator[None]:
         if key not in files:
             stream.seek(0)
             files[key] = pickle.dumps(load(stream, Loader))
-        return pickle.loads(files[key])  # much faster than a deep copy
+        return pickle.loads(files[key])  # noqa: S301 - our own, and much faster than a copy
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(OverridesParser, "parse_rule", parse_once)
