@@ -35,6 +35,7 @@ from hypothesis import HealthCheck, settings
 
 from tests import forks, pdflatex
 from xrgs import composing, config
+from xrgs.errors import XrgsError
 from xrgs.evaluation.lpips import weights
 from xrgs.mixture import variant
 from xrgs.safeio import code
@@ -220,9 +221,11 @@ def composed_by_hydra(*overrides: str) -> config.Conf:
     return deepcopy(_composed(overrides, tuple(environment)))
 
 
-#: An override with a number, a flag or a name, and keys from which `conf/` takes other values.
-_PLAIN = re.compile(r"([a-z]\w*(?:\.\w+)+|threads|checkpoint_s)=([-+\w.]+)")
+#: An override with a number, a flag, a name or a path, and keys from which `conf/` takes others.
+_PLAIN = re.compile(r"([a-z]\w*(?:\.\w+)+|threads|checkpoint_s|store)=([-+\w./]+)")
 _TAKEN_FROM = frozenset({"splat.raster.background", "splat.densify.stop"})
+#: Words that make no config without the plain ones.
+_incomplete: set[tuple[str, ...]] = set()
 
 
 def composed(*overrides: str) -> config.Conf:
@@ -230,16 +233,22 @@ def composed(*overrides: str) -> config.Conf:
 
     tests/test_config.py compares the two. Whatever is not plain, or wrong, is left to Hydra.
     """
-    plain = [word for word in overrides if _PLAIN.fullmatch(word)]
+    plain = [word.split("=") for word in overrides if _PLAIN.fullmatch(word)]
+    others = tuple(word for word in overrides if not _PLAIN.fullmatch(word))
+    if not plain or others in _incomplete or _TAKEN_FROM & {key for key, _ in plain}:
+        return composed_by_hydra(*overrides)
     try:
-        values = asdict(composed_by_hydra(*(word for word in overrides if word not in plain)))
-        for key, text in (word.split("=") for word in plain):
+        values = asdict(composed_by_hydra(*others))
+    except Exception:  # a value is missing
+        _incomplete.add(others)
+        return composed_by_hydra(*overrides)
+    try:
+        for key, text in plain:
             *groups, name = key.split(".")
             group = reduce(getitem, groups, values)
             group[name] = _value_like(group[name], text)
-            assert key not in _TAKEN_FROM
         return composing.to_conf(values)  # type: ignore[arg-type]
-    except Exception:  # a value that another word needs, an unknown key, a wrong type
+    except (KeyError, TypeError, XrgsError):  # an unknown key, a wrong type or value
         return composed_by_hydra(*overrides)
 
 
@@ -248,7 +257,8 @@ def _value_like(old: Any, text: str) -> Any:
     new = yaml.safe_load(text)
     if type(old) is float and type(new) is int:
         return float(new)
-    assert type(new) is type(old)
+    if type(new) is not type(old):
+        raise TypeError(text)
     return new
 
 

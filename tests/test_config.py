@@ -331,7 +331,12 @@ def test_configs_are_composed_in_threads() -> None:
 def test_a_plain_value_in_a_composed_config_is_hydras() -> None:
     """Other tests set numbers, flags and names without Hydra."""
     values = "train.steps=40 splat.backend=torch splat.densify.budget=1 threads=3 checkpoint_s=1e-9"
-    words = (*values.split(), "variant.sfm.reference=false", "splat.optimizer.eps=0.5")
+    words = (
+        *values.split(),
+        "variant.sfm.reference=false",
+        "splat.optimizer.eps=0.5",
+        "store=/a/b",
+    )
     for arm in ((), ("+ablation=mip",), ("scene=motorcycle", "preset=smoke")):
         assert composed(*arm, *words) == composed_by_hydra(*arm, *words)
     with pytest.raises(OmegaConfBaseException, match=r"train\.steps"):
