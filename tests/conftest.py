@@ -201,7 +201,7 @@ def random_weights() -> weights.Weights:
     return deepcopy(_random_weights())
 
 
-#: Tests put `composed_by_hydra` in its place.
+#: The function itself: tests of commands put `composed_by_hydra` in its place.
 _compose = composing.compose
 
 
