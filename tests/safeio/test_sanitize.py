@@ -254,11 +254,18 @@ DOORS = {
 }
 
 
+def dotted(node: ast.expr) -> str:
+    """The dotted name of an expression; what is no name in it is a question mark."""
+    if isinstance(node, ast.Attribute):
+        return f"{dotted(node.value)}.{node.attr}"
+    return node.id if isinstance(node, ast.Name) else "?"
+
+
 @cache
 def calls() -> list[tuple[str, str, ast.Call]]:
     """Every call of the package: the module, the dotted name of what it calls, and its node."""
     return [
-        (path.relative_to(PACKAGE).with_suffix("").as_posix(), ast.unparse(node.func), node)
+        (path.relative_to(PACKAGE).with_suffix("").as_posix(), dotted(node.func), node)
         for path in PACKAGE.rglob("*.py")
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
         if isinstance(node, ast.Call)
