@@ -8,6 +8,8 @@ import importlib
 import io
 import json
 import os
+import pickle
+import re
 import shutil
 import signal
 import subprocess
@@ -18,9 +20,10 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from copy import deepcopy
-from dataclasses import dataclass, field
-from functools import cache, partial
+from dataclasses import asdict, dataclass, field
+from functools import cache, partial, reduce
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from operator import getitem
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,6 +35,7 @@ from hypothesis import HealthCheck, settings
 
 from tests import forks, pdflatex
 from xrgs import composing, config
+from xrgs.errors import XrgsError
 from xrgs.evaluation.lpips import weights
 from xrgs.mixture import variant
 from xrgs.safeio import code
@@ -83,7 +87,7 @@ def _no_disk_is_waited_for() -> Iterator[None]:
 def _hydra_reads_equal_text_once() -> Iterator[None]:
     """Keep what Hydra parses of a word and of a file: most of the time of a config goes there."""
     words: dict[tuple[str, str], Any] = {}
-    files: dict[tuple[str, str], Any] = {}
+    files: dict[tuple[str, str], bytes] = {}
     parse, load = OverridesParser.parse_rule, yaml.load
 
     def parse_once(parser: OverridesParser, word: str, rule: str) -> Any:
@@ -97,8 +101,8 @@ def _hydra_reads_equal_text_once() -> Iterator[None]:
         key = stream.read(), Loader.__name__
         if key not in files:
             stream.seek(0)
-            files[key] = load(stream, Loader)
-        return deepcopy(files[key])
+            files[key] = pickle.dumps(load(stream, Loader))
+        return pickle.loads(files[key])  # noqa: S301 - our own, and much faster than a copy
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(OverridesParser, "parse_rule", parse_once)
@@ -120,7 +124,7 @@ def _equal_source_is_read_once() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(code, "meaning", cache(code.meaning))
-        patch.setattr(code, "_own_imports", own_imports_once)
+        patch.setattr(code, "_own_imports", cache(own_imports_once))
         yield
 
 
@@ -197,12 +201,16 @@ def random_weights() -> weights.Weights:
     return deepcopy(_random_weights())
 
 
+#: The function itself: tests of commands put `composed_by_hydra` in its place.
+_compose = composing.compose
+
+
 @cache
 def _composed(overrides: tuple[str, ...], _environment: tuple[tuple[str, str], ...]) -> config.Conf:
-    return composing.compose(*overrides)
+    return _compose(*overrides)
 
 
-def composed(*overrides: str) -> config.Conf:
+def composed_by_hydra(*overrides: str) -> config.Conf:
     """Compose a config as `composing.compose` does, but equal ones once: Hydra takes 0.1 s each.
 
     `preset=laptop` stands for the default preset: tests know gsplat's own learning rates.
@@ -211,6 +219,47 @@ def composed(*overrides: str) -> config.Conf:
         overrides = ("preset=laptop", *overrides)
     environment = sorted(item for item in os.environ.items() if item[0].startswith("XRGS_"))
     return deepcopy(_composed(overrides, tuple(environment)))
+
+
+#: An override with a number, a flag, a name or a path, and keys from which `conf/` takes others.
+_PLAIN = re.compile(r"([a-z]\w*(?:\.\w+)+|threads|checkpoint_s|store)=([-+\w./]+)")
+_TAKEN_FROM = frozenset({"splat.raster.background", "splat.densify.stop"})
+#: Words that make no config without the plain ones.
+_incomplete: set[tuple[str, ...]] = set()
+
+
+def composed(*overrides: str) -> config.Conf:
+    """Return `composed_by_hydra`, but set plain values in the config of the other words.
+
+    tests/test_config.py compares the two. Whatever is not plain, or wrong, is left to Hydra.
+    """
+    plain = [word.split("=") for word in overrides if _PLAIN.fullmatch(word)]
+    others = tuple(word for word in overrides if not _PLAIN.fullmatch(word))
+    if not plain or others in _incomplete or _TAKEN_FROM & {key for key, _ in plain}:
+        return composed_by_hydra(*overrides)
+    try:
+        values = asdict(composed_by_hydra(*others))
+    except Exception:  # a value is missing
+        _incomplete.add(others)
+        return composed_by_hydra(*overrides)
+    try:
+        for key, text in plain:
+            *groups, name = key.split(".")
+            group = reduce(getitem, groups, values)
+            group[name] = _value_like(group[name], text)
+        return composing.to_conf(values)  # type: ignore[arg-type]
+    except (KeyError, TypeError, XrgsError):  # an unknown key, a wrong type or value
+        return composed_by_hydra(*overrides)
+
+
+def _value_like(old: Any, text: str) -> Any:
+    """Read the text of an override that has the type of the value in its place."""
+    new = yaml.safe_load(text)
+    if type(old) is float and type(new) is int:
+        return float(new)
+    if type(new) is not type(old):
+        raise TypeError(text)
+    return new
 
 
 @pytest.fixture(scope="session")

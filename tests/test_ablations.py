@@ -73,6 +73,7 @@ def test_each_ablation_is_another_cell(name: str, composed: Compose) -> None:
     assert from_dict(json.loads(json.dumps(asdict(ablation)))) == ablation
 
 
+@pytest.mark.slow
 def test_no_two_ablations_are_the_same_cell(composed: Compose) -> None:
     confs = [composed(f"+ablation={name}") for name in ABLATIONS]
     # Two controls differ only in the cell whose number of Gaussians they have to reach.

@@ -28,6 +28,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 import xrgs
+from tests.conftest import composed, composed_by_hydra
 from xrgs.composing import error_line, escape_interpolations, from_dict, from_file
 from xrgs.config import (
     CONF_DIR,
@@ -46,6 +47,12 @@ SETTINGS: dict[str, RasterSettings | OptimizerSettings | DensifySettings] = {
     "optimizer": OptimizerSettings(),
     "densify": DensifySettings(),
 }
+
+
+@pytest.fixture(scope="module")
+def compose() -> Compose:
+    """Return the function (*overrides) -> their config, as Hydra composes it."""
+    return composed_by_hydra
 
 
 def schema_keys(schema: type[Any] = Conf, prefix: str = "") -> Iterator[tuple[str, Field[Any]]]:
@@ -319,6 +326,23 @@ def test_configs_are_composed_where_hydra_is_in_use_and_leave_it_as_it_was(
 def test_configs_are_composed_in_threads() -> None:
     with ThreadPoolExecutor(4) as pool:
         assert [*pool.map(lambda seed: xrgs.compose(f"seed={seed}").seed, range(4))] == [0, 1, 2, 3]
+
+
+def test_a_plain_value_in_a_composed_config_is_hydras() -> None:
+    """Other tests set numbers, flags and names without Hydra."""
+    values = "train.steps=40 splat.backend=torch splat.densify.budget=1 threads=3 checkpoint_s=1e-9"
+    words = (
+        *values.split(),
+        "variant.sfm.reference=false",
+        "splat.optimizer.eps=0.5",
+        "store=/a/b",
+    )
+    for arm in ((), ("+ablation=mip",), ("scene=motorcycle", "preset=smoke")):
+        assert composed(*arm, *words) == composed_by_hydra(*arm, *words)
+    with pytest.raises(HydraException, match=r"train\.steps=many"):
+        composed("train.steps=many")
+    with pytest.raises(XrgsError, match=r"^splat\.init_scale=0\.0: "):
+        composed("splat.init_scale=0")
 
 
 def test_values_are_of_their_types_and_interpolations_resolved(compose: Compose) -> None:

@@ -7,6 +7,7 @@ file `splats.ply`, `gaussians`, a `camera`, `data` to train on, and a `variant_i
 from __future__ import annotations
 
 import doctest
+import shutil
 from importlib import import_module
 from pathlib import Path
 
@@ -25,11 +26,21 @@ MODULES = [
 ]
 
 
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The store that examples read; each has a copy."""
+    folder = tmp_path_factory.mktemp("examples") / "xrgs-store"
+    reference_store.build(folder)
+    return folder
+
+
 @pytest.fixture
-def names(data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
+def names(
+    data: Dataset, store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> dict[str, object]:
     """The names that examples may use; the current folder has the files that they read."""
     monkeypatch.chdir(tmp_path)
-    reference_store.build(Path("xrgs-store"))
+    shutil.copytree(store, "xrgs-store")
     torch.manual_seed(0)
     points = torch.rand(50, 3) + torch.tensor([-0.5, -0.5, 2.0])
     gaussians = xrgs.Gaussians.from_points(points, torch.rand(50, 3))

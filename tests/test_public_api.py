@@ -41,6 +41,7 @@ def python(script: str, **environment: str) -> subprocess.CompletedProcess[str]:
     )
 
 
+@pytest.mark.slow
 def test_openmps_threads_sleep_unless_the_environment_says_otherwise() -> None:
     done = python("import os, xrgs; print(os.environ['OMP_WAIT_POLICY']); xrgs.rasterize")
     assert (done.stdout.split(), done.stderr) == (["passive"], "")
@@ -48,6 +49,7 @@ def test_openmps_threads_sleep_unless_the_environment_says_otherwise() -> None:
     assert (done.stdout.split(), done.stderr) == (["active"], "")
 
 
+@pytest.mark.slow
 def test_torch_before_xrgs_is_warned_of_once_where_something_renders() -> None:
     script = "import torch, xrgs; xrgs.load_gaussians; xrgs.train; xrgs.rasterize; xrgs.train"
     done = python(script)

@@ -133,6 +133,7 @@ def test_changes_have_students_interval_over_scenes(race: Any) -> None:
     assert row[-1] == f"{change:+.2f} ({100 * low:+.2f} to {100 * high:+.2f}), better on 3 of 4"
 
 
+@pytest.mark.slow
 def test_a_busy_machine_gives_no_result(race: Any, tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     page.write_text("# Speed\n<!-- race -->\nold\n<!-- end of the race -->\nmore\n")

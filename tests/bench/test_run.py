@@ -99,6 +99,7 @@ def test_the_files_hold_the_results(smoke: Smoke) -> None:
     assert (folder / "o" / "bench.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_a_file_is_timed(file: Path, tmp_path: Path) -> None:
     settings = Settings(load=str(file), out=str(tmp_path / "o"), json=str(tmp_path / "a.json"))
     settings.repeats = settings.threads = 1

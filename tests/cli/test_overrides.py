@@ -13,6 +13,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf.errors import ConfigKeyError
 
+from tests.conftest import composed_by_hydra
 from xrgs import config
 from xrgs.cli.overrides import explained, with_options_first, with_quotes
 from xrgs.cli.sweep import texts
@@ -28,6 +29,12 @@ ODD = (
     *("a b", " lead", "trail ", "-x", "~nobody", "50%", "a=b", "it's", 'q"q', "#h", "!x", "[x]"),
     *("{y}", "(p)", "$x", "a:b", "*", ACCENT, WHOLE, "🙂", "1e3", "true", "007", "a\\b'"),
 )
+
+
+@pytest.fixture(scope="module")
+def compose() -> Callable[..., config.Conf]:
+    """Return the function (*overrides) -> their config, as Hydra composes it."""
+    return composed_by_hydra
 
 
 def parsed(word: str) -> object:

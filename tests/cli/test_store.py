@@ -64,6 +64,7 @@ def xrgs_store(
     return run
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("xrgs_store")
 def test_a_reader_of_the_list_that_ends_first_is_no_error(tmp_path: Path) -> None:
     reader, writer = os.pipe()

@@ -72,6 +72,7 @@ def test_a_sweep_trains_each_cell_once_and_ends_with_the_table(
     assert record.cells[1].baseline_id == record.cells[0].cell_id
 
 
+@pytest.mark.slow
 def test_without_the_baseline_the_ablations_are_trained_alone(
     sweep_here: SweepHere, children: Any, tmp_path: Path
 ) -> None:
@@ -293,6 +294,7 @@ def test_a_dry_run_says_each_error_once_and_fails(
     assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
 
 
+@pytest.mark.slow
 def test_a_dry_run_fails_where_photographs_are_missing_and_says_once_how_to_get_them(
     sweep_here: SweepHere, tmp_path: Path
 ) -> None:

@@ -11,6 +11,8 @@ from typing import Any
 
 import pytest
 
+from tests.conftest import composed_by_hydra
+from xrgs import composing
 from xrgs.bench.speed import Trial
 from xrgs.cli import budget, sweep, train
 from xrgs.photos.scenes import motorcycle
@@ -31,6 +33,7 @@ def handed_over(
         words: list[str] = []
         found = train._Placed("0123-4567", mixture, SfmReport())
         monkeypatch.setattr(train, "_place", lambda _: found)
+        monkeypatch.setattr(composing, "compose", composed_by_hydra)
         monkeypatch.setattr(train, "_measured_unit", lambda _: 1e-7)
         monkeypatch.setattr(train, "_units_of_a_step", lambda *_: 1e5)
         monkeypatch.setattr(train, "_trial", lambda *_: Trial(start_s=0.0, step_s=0.01))

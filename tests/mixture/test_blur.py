@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,7 @@ def estimated(views: Sequence[View]) -> float:
     return blur
 
 
+@cache
 def texture(seed: int, height: int = 320, width: int = 400) -> np.ndarray:
     """A random image whose power falls by the square of the frequency, as of photographs."""
     white = np.random.default_rng(seed).normal(size=(height, width))

@@ -58,6 +58,7 @@ def stereo_pair(
     return work, sfm.reconstruct(inputs, work, work, sfm_conf)
 
 
+@pytest.mark.slow
 def test_the_stereo_pair_is_registered_with_its_known_intrinsics(stereo_pair: StereoPair) -> None:
     model = stereo_pair[1]
     assert model.report["registered"] == len(model.viewmats) == 2
@@ -82,6 +83,7 @@ def test_two_views_keep_the_focal_length_that_they_begin_with(
     assert any("focal length is a guess" in note for note in model.report["notes"])
 
 
+@pytest.mark.slow
 def test_its_points_lie_at_the_depths_of_the_published_disparity(stereo_pair: StereoPair) -> None:
     """Depths of SfM are right up to one scale: their ratio to the true ones is one number."""
     model = stereo_pair[1]
@@ -97,6 +99,7 @@ def test_its_points_lie_at_the_depths_of_the_published_disparity(stereo_pair: St
     assert np.median(np.abs(ratio / np.median(ratio) - 1)) < 0.02
 
 
+@pytest.mark.slow
 def test_any_number_of_threads_gives_the_same_cameras(
     compose: Callable[..., Conf], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.report.conftest import configured, finish_again
@@ -189,6 +189,7 @@ def test_each_replicate_is_judged_by_itself(made: Any) -> None:
     assert len(found) == 2
 
 
+@settings(max_examples=40)
 @given(st.lists(st.integers(-2000, 2000), min_size=3, max_size=9, unique=True))
 def test_it_is_what_leaving_out_each_view_in_turn_says(hundredths: list[int]) -> None:
     scores = 20.0 + np.array(hundredths) / 100

@@ -88,6 +88,7 @@ def test_renders_are_scored_against_the_photographs(
     assert pd.isna(row[["training_time_s", "gaussians", "lpips"]]).all()
 
 
+@pytest.mark.slow
 def test_the_report_has_one_more_column(
     made: MakeStore, frozen_variant: Callable[..., str], tmp_path: Path
 ) -> None:

@@ -105,6 +105,7 @@ def test_the_terminal_has_table_failures_and_folder(reported: Report) -> None:
     assert reported.text.endswith(f"Page: {reported.folder / 'report.html'}")
 
 
+@pytest.mark.slow
 def test_a_report_of_held_out_training_views_says_so_and_shows_them(made: Any) -> None:
     for label in ("baseline", "consistency"):
         made.add(label, condition="train.validation=0.1", validation=0.1, pictures=True)

@@ -132,6 +132,7 @@ def test_a_score_that_is_not_known_leaves_out_its_panel(made: Any) -> None:
     assert psnr["change"].isna().tolist() == [False, True, False]
 
 
+@pytest.mark.slow
 def test_of_many_pictures_the_first_are_drawn_and_the_rest_said(
     made: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -56,6 +56,7 @@ def test_an_ignored_signal_stays_ignored() -> None:
     assert stopped("nohup", signal.SIGINT) == (0, "ready\ntidied up\n", "")
 
 
+@pytest.mark.slow
 def test_colmap_leaves_the_handlers_of_signals_as_they_were() -> None:
     """COLMAP's log library takes SIGTERM and the signals of crashes, and prints a stack at them."""
     script = """

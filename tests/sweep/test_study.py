@@ -16,6 +16,7 @@ from hydra.core.utils import JobReturn, JobStatus
 from hydra.errors import CompactHydraException
 from omegaconf import DictConfig
 
+from tests.conftest import composed_by_hydra
 from xrgs import config
 from xrgs.errors import XrgsError
 from xrgs.evaluation.lpips import download, weights
@@ -118,11 +119,13 @@ def test_seeds_share_one_composed_config_and_each_cell_is_identified_once(
 
 
 def test_cells_that_differ_in_numbers_share_one_config_and_get_their_own_values(
-    study: Callable[..., Study], compose: Callable[..., config.Conf]
+    study: Callable[..., Study],
 ) -> None:
     made = study()
     plan = made._plan(["preset=laptop", "variant.factor=2,5", "variant.hr_fraction=0.1,0.5"])
-    assert [cell.conf for cell in plan] == [compose(*cell.spec.overrides) for cell in plan]
+    assert [cell.conf for cell in plan] == [
+        composed_by_hydra(*cell.spec.overrides) for cell in plan
+    ]
     assert len(plan) == 4
     assert len(made._context.config_loader.composed) == 1  # type: ignore[attr-defined]
     with pytest.raises(XrgsError, match=r"^variant.factor=0: "):

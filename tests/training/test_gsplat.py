@@ -75,6 +75,7 @@ def test_fifty_steps_are_those_of_the_native_backend(data: Dataset, ablation: st
         }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("training", TRAININGS)
 def test_training_leaves_no_tensor_on_the_processor(data: Dataset, training: str) -> None:
     conf = compose(
@@ -91,6 +92,7 @@ class Kill(BaseException):
     """Ends a run as a kill does."""
 
 
+@pytest.mark.slow
 def test_a_killed_run_continues(
     data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

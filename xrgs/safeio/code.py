@@ -67,9 +67,12 @@ class CodeFolders:
         files |= {f"{folder}/__init__.py" for folder in self.folders_of_parts}
         return tuple(sorted(self._with_imports(files, self.parts) - self.registries))
 
-    def part(self, file: str) -> tuple[str, ...]:
-        """Return the file of a part, and the files of `folders_of_parts` that it needs, sorted."""
-        others = {*self.core(), *self.registries}
+    def part(self, file: str, core: tuple[str, ...] = ()) -> tuple[str, ...]:
+        """Return the file of a part, and the files of `folders_of_parts` that it needs, sorted.
+
+        A caller that asks for several parts gives `core()`, which takes most of the time.
+        """
+        others = {*(core or self.core()), *self.registries}
         return tuple(sorted(self._with_imports({file}, others)))
 
     def needed_by(self, files: Iterable[Path]) -> dict[str, Path]:

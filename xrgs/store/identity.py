@@ -123,12 +123,13 @@ def _files(
     backend: str, components: tuple[str, ...], init: str, strategy: str
 ) -> dict[str, tuple[str, ...]]:
     """Return the source files of each part of the code, relative to the package."""
-    files: dict[str, tuple[str, ...]] = {"core": CODE.core(), **_BACKENDS[backend]}
+    core = CODE.core()
+    files: dict[str, tuple[str, ...]] = {"core": core, **_BACKENDS[backend]}
     if init in _STARTS:
         files[init] = _STARTS[init]
     if strategy in STRATEGIES:  # else the config is refused
-        files[f"strategy/{strategy}"] = CODE.part(f"splat/strategy/{strategy}.py")
-    return files | {key: CODE.part(file) for key in components if (file := file_of(key))}
+        files[f"strategy/{strategy}"] = CODE.part(f"splat/strategy/{strategy}.py", core)
+    return files | {key: CODE.part(file, core) for key in components if (file := file_of(key))}
 
 
 def changed_code(identity: Identity, *, cached: bool = False) -> list[str]:

@@ -38,9 +38,9 @@ _CODE = CodeFolders(
 @cache
 def scoring_code(also: frozenset[str] = frozenset()) -> dict[str, str]:
     """Return the digest of the protocol and of each score, by name, `also` of some `ON_REQUEST`."""
-    names = {*VIEW_METRICS, *also}
-    scores = {n: code_digest(*_CODE.part(file)) for n, file in _FILES.items() if n in names}
-    return without_refactorings({PROTOCOL: code_digest(*_CODE.core()), **scores})
+    names, core = {*VIEW_METRICS, *also}, _CODE.core()
+    scores = {n: code_digest(*_CODE.part(file, core)) for n, file in _FILES.items() if n in names}
+    return without_refactorings({PROTOCOL: code_digest(*core), **scores})
 
 
 def without_refactorings(codes: Mapping[str, str]) -> dict[str, str]:

@@ -188,6 +188,7 @@ def test_a_damaged_file_costs_what_it_shows_alone(copied: Path) -> None:
     assert [model["label"] for model in data["models"]] == ["baseline"]
 
 
+@pytest.mark.slow
 def test_a_page_that_is_too_large_says_what_it_left_out(
     copied: Path, page: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -28,6 +28,7 @@ def errors(scene: TrueScene, number: int, depths: DepthMap) -> tuple[np.ndarray,
     return off / (exact[good] / depths.view.finest.focal[0]), off / exact[good]
 
 
+@pytest.mark.slow
 def test_most_depths_are_good_and_nearly_exact(
     scene: TrueScene, swept: tuple[list[SweptView], dict[int, DepthMap]]
 ) -> None:
@@ -61,6 +62,7 @@ def test_fine_depths_are_exact_to_half_a_pixel_at_the_usual_size() -> None:
     assert np.median(np.concatenate(fine)) < 0.5
 
 
+@pytest.mark.slow
 def test_squares_lie_on_the_surfaces_in_their_colours(
     scene: TrueScene, swept: tuple[list[SweptView], dict[int, DepthMap]]
 ) -> None:
@@ -86,6 +88,7 @@ def test_squares_lie_on_the_surfaces_in_their_colours(
     assert 0.6 < area[near].sum() / (height * width) < 1.2
 
 
+@pytest.mark.slow
 def test_finer_views_own_the_places_that_several_views_have(
     swept: tuple[list[SweptView], dict[int, DepthMap]],
 ) -> None:
@@ -95,6 +98,7 @@ def test_finer_views_own_the_places_that_several_views_have(
     assert len(own.points) < len(both.points) < 1.15 * len(own.points)
 
 
+@pytest.mark.slow
 def test_masked_pixels_are_neither_swept_nor_matched(scene: TrueScene) -> None:
     views = []
     for view in scene.data.train:
