@@ -14,6 +14,7 @@ from xrgs.runtime import machine
 from xrgs.runtime.machine import (
     gpus,
     set_portable_blas,
+    set_portable_mkl,
     single_torch_thread,
     usable_cores,
 )
@@ -123,6 +124,17 @@ def test_openblas_has_the_kernels_of_avx2_wherever_there_is_avx2(
     monkeypatch.setenv("OPENBLAS_CORETYPE", "Zen")
     set_portable_blas(cpuinfo)
     assert os.environ["OPENBLAS_CORETYPE"] == "Zen"
+
+
+def test_mkl_computes_alike_on_every_processor_unless_the_user_says_otherwise(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.delenv("MKL_CBWR", raising=False)
+    set_portable_mkl()
+    assert os.environ["MKL_CBWR"] == "COMPATIBLE"
+    monkeypatch.setenv("MKL_CBWR", "AVX2")
+    set_portable_mkl()
+    assert os.environ["MKL_CBWR"] == "AVX2"
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from platform import machine
 from types import SimpleNamespace
 from typing import Any
 
@@ -393,3 +394,30 @@ def test_images_are_made_again_of_trimmed_variants_alone(
     assert work == "variant"
     assert (request["variant"], request["store"]) == ("k-1", str(store.path))
     assert request["conf"]["scene"]["kind"] == "motorcycle"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(machine() != "x86_64", reason="these instruction sets are of x86-64")
+def test_other_instruction_sets_build_the_same_variant(
+    compose: Callable[..., Conf], tmp_path: Path
+) -> None:
+    """The id has a hash of the photographs, cameras and points.
+
+    OpenBLAS and MKL are pinned. Left free, MKL renders other photographs on most processors.
+    """
+    changes = ("variant.long_side=252", "variant.sfm.reference=false")
+    conf = compose("scene=procedural", "scene.views=6", *changes)
+    older = {
+        "ATEN_CPU_CAPABILITY": "avx2",
+        "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX512F,-AVX512VL",
+        "MKL_ENABLE_INSTRUCTIONS": "AVX2",
+        "NPY_DISABLE_CPU_FEATURES": "AVX512F AVX512CD AVX512_SKX AVX512_ICL AVX512_SPR X86_V4",
+        "OMP_NUM_THREADS": "1",
+        "PYTHON_CPU_COUNT": "1",
+    }
+    built = []
+    for name, environment in (("own", {}), ("older", older)):
+        store = Store(tmp_path / name)
+        store.prepare()
+        built.append(build_variants.build(conf, store, environment=environment))
+    assert built[0] == built[1]

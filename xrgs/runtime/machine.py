@@ -102,6 +102,16 @@ def set_portable_blas(cpuinfo: Path = Path("/proc/cpuinfo")) -> None:
         os.environ.setdefault("OPENBLAS_CORETYPE", "Haswell")
 
 
+def set_portable_mkl() -> None:
+    """Make MKL, torch's BLAS, compute with the same instructions on every x86-64 processor.
+
+    By default it has other kernels for AVX2, for AVX-512 and for AMD, whose last digits differ.
+    They turned single pixels of the embedded scene, and so its cameras. MKL reads MKL_CBWR at its
+    first call. A value that is already in the environment is kept.
+    """
+    os.environ.setdefault("MKL_CBWR", "COMPATIBLE")
+
+
 def set_huge_pages() -> None:
     """Make glibc of child processes take memory in huge pages, and keep some that is freed.
 

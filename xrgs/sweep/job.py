@@ -33,7 +33,12 @@ import msgspec
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.mixture.paths import trimmed_folder
 from xrgs.runtime import lease, processes
-from xrgs.runtime.machine import gpus, set_huge_pages, set_portable_blas
+from xrgs.runtime.machine import (
+    gpus,
+    set_huge_pages,
+    set_portable_blas,
+    set_portable_mkl,
+)
 from xrgs.runtime.progress import log_line
 from xrgs.runtime.signals import StopRequest, StopSignal, end_by_sigterm
 from xrgs.runtime.streams import guard_streams, log_to_stderr, say
@@ -478,6 +483,7 @@ def _make_variant(request: Mapping[str, Any]) -> dict[str, Any]:
     from xrgs.store.trimming import restore_variant
 
     log_to_stderr()
+    set_portable_mkl()
     conf, store = from_dict(request["conf"]), Store(Path(request["store"]))
     if (trimmed := request.get("variant")) is None:
         built = variant.build(conf.scene, conf.variant, store.variants, store.scenes)
