@@ -124,6 +124,25 @@ def test_no_gaussians_give_the_background(backend: str, packed: bool) -> None:
     assert meta["radii"].numel() == 0
 
 
+@pytest.mark.parametrize(("backend", "dtype"), [("native", "bfloat16"), ("torch", "float16")])
+def test_autocast_changes_nothing(backend: str, dtype: str) -> None:
+    """Autocast rounds matrix products to 8 or 11 bits; gsplat's kernels compute in float32."""
+    scene = arguments(backend=backend, render_mode="RGB+ED")
+    scene["means"][:, 2] += 2
+    trained = scene["means"].requires_grad_()
+
+    wanted = rasterization(**scene)
+    with torch.autocast("cpu", dtype=getattr(torch, dtype)):
+        assert (trained.detach() @ torch.eye(3)).dtype is getattr(torch, dtype)
+        got = rasterization(**scene)
+    # The backward pass belongs outside, by torch's documentation.
+    gradients = [torch.autograd.grad(image.sum(), trained)[0] for image, _, _ in (got, wanted)]
+    values = [[image, alpha, meta["means2d"]] for image, alpha, meta in (got, wanted)]
+    for value, usual in [*zip(*values, strict=True), gradients]:
+        assert usual.std() > 0.01
+        assert torch.equal(value, usual)
+
+
 @pytest.mark.parametrize(("backend", "sh_degree"), [("native", 1), ("torch", None)])
 def test_tensors_that_are_not_contiguous(backend: str, sh_degree: int | None) -> None:
     usual = arguments(sh_degree=sh_degree, backend=backend)
