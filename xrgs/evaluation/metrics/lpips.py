@@ -32,8 +32,8 @@ def lpips(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | 
         return None
     import torch
 
-    from xrgs.evaluation.lpips.network import MIN_SIDE, distance
+    from xrgs.evaluation.lpips.network import distance
 
-    if min(image.shape[:2]) < MIN_SIDE:
+    if min(image.shape[:2]) < weights.ALEX.min_side:
         return None
     return float(distance(image, target, {k: torch.from_numpy(v) for k, v in published.items()}))
