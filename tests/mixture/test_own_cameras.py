@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from xrgs.mixture import own_cameras
+from xrgs.mixture import sfm
 
 
 def cropped(factor: float, odd: Sequence[int]) -> tuple[Any, dict[str, tuple[int, str]]]:
@@ -42,7 +42,7 @@ def test_views_that_were_cropped_don_t_share_the_camera(
 ) -> None:
     model, given = cropped(factor, odd)
     before = {number: view.cam_from_world().matrix() for number, view in model.images.items()}
-    apart = own_cameras.other_cameras(model, given)
+    apart = sfm.other_cameras(model, given)
     assert sorted(apart) == list(odd)
     assert len({*apart.values()}) == 1
     assert len(model.cameras) == 1  # the model stays as it is
@@ -52,11 +52,11 @@ def test_views_that_were_cropped_don_t_share_the_camera(
 
 def test_cameras_that_are_known_or_apart_already_are_not_tried() -> None:
     model, given = cropped(1 / 0.7, (2, 5, 6))
-    assert own_cameras.other_cameras(model, {}) == {}
+    assert sfm.other_cameras(model, {}) == {}
     own = {name: (i, name) for name, (i, _) in given.items()}
-    assert own_cameras.other_cameras(model, own) == {}
+    assert sfm.other_cameras(model, own) == {}
 
 
 def test_focal_lengths_are_grouped_by_gaps() -> None:
     focals = {0: 100.0, 1: 103.0, 2: 200.0, 3: 101.0, 4: 300.0, 5: 207.0}
-    assert own_cameras.groups_of_focals(focals) == [[0, 3, 1], [2, 5], [4]]
+    assert sfm.groups_of_focals(focals) == [[0, 3, 1], [2, 5], [4]]

@@ -15,7 +15,7 @@ from scipy.ndimage import map_coordinates
 from skimage import data
 
 from xrgs.config import VariantConf
-from xrgs.mixture import poses, triangulation
+from xrgs.mixture import poses, sfm_retries
 from xrgs.mixture.photographs import PhotoCollection, prepare_hr_views
 from xrgs.photos.scenes import Scene
 
@@ -74,7 +74,7 @@ def test_points_of_distorted_and_turned_photographs_are_on_the_wall(
 ) -> None:
     model = poses.read_poses(str(tmp_path / "poses"), photos)
     assert len(model.points) == 0
-    found = triangulation.with_points(model, photos, (), configured().sfm, tmp_path)
+    found = sfm_retries.with_points(model, photos, (), configured().sfm, tmp_path)
     assert len(found.points) > 50
     # Given poses are moved to a world of their own: bring the points back to the wall's.
     on_wall = (found.points - model.world[:3, 3]) @ model.world[:3, :3]

@@ -19,7 +19,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,9 +30,6 @@ from xrgs.errors import UnreadableError, XrgsError
 from xrgs.photos import colour, tiff
 from xrgs.safeio.atomic import atomic_writer
 from xrgs.safeio.files import is_transient
-
-if TYPE_CHECKING:
-    from typing import BinaryIO
 
 ImageArray = NDArray[np.float32]  # [H, W, 3]
 

@@ -9,13 +9,10 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
-
-if TYPE_CHECKING:
-    from typing import BinaryIO
 
 _WHITE = 65535
 #: If no 16-bit value is larger, the file uses 14 bits or fewer, like cameras' sensors.

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from xrgs.photos.download import unpack as unpack_module
-from xrgs.photos.download.unpack import UnpackError, unpack
+from xrgs.photos.download.scenes import UnpackError, unpack
 
 GOOD = {"set/fern/images/a.png": b"a" * 50, "set/fern/poses.npy": b"p", "set/room/b.png": b"b"}
 

@@ -5,19 +5,13 @@ Source: [zhang2018], and the authors' package `lpips`.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Mapping
 
 import torch
+from torch import Tensor
 from torch.nn.functional import conv2d, max_pool2d, relu
 
-from xrgs.evaluation.lpips.weights import ALEX
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-
-    from torch import Tensor
-
-    from xrgs.evaluation.lpips.weights import Network
+from xrgs.evaluation.lpips.weights import ALEX, Network
 
 #: The authors' normalisation of an image in -1..1: mean and standard deviation of each channel.
 _SHIFT = (-0.030, -0.088, -0.188)

@@ -15,8 +15,8 @@ def lpips_vgg(image: Tensor, target: Tensor, mask: Tensor | None = None) -> floa
     """Compute the perceptual distance LPIPS, version 0.1, with VGG16 (`vgg` in gsplat).
 
     It takes about 3 s for a view of 500 x 375 px on one core, and four times as long for twice the
-    size. Source: [zhang2018]; see `xrgs.evaluation.lpips.network`. All else is as for `lpips`, except
-    that a machine without weights is a WeightsError.
+    size. Source: [zhang2018]; see `xrgs.evaluation.lpips.network`. All else is as for `lpips`,
+    except that a machine without weights is a WeightsError.
     """
     image, target = inside(image, target, mask)
     known = load_vgg()

@@ -8,14 +8,12 @@ includes only the code of its own policy. The value `flag` has no policy: it sel
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
+from xrgs.mixture.sampling_rate import Measures
 from xrgs.mixture.tags.distance import Distance
 from xrgs.mixture.tags.megapixels import Megapixels
 from xrgs.mixture.tags.sampling_rate import SamplingRate
-
-if TYPE_CHECKING:
-    from xrgs.mixture.sampling_rate import Measures
 
 
 class TagPolicy(Protocol):

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from xrgs.mixture.sampling_rate import Measures
+from xrgs.mixture.sampling_rate import Measures
 
 
 class Distance:

@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from xrgs.mixture.sampling_rate import sampling_rate
-
-if TYPE_CHECKING:
-    from xrgs.mixture.sampling_rate import Measures
+from xrgs.mixture.sampling_rate import Measures, sampling_rate
 
 
 class SamplingRate:

@@ -13,29 +13,23 @@ import os
 import re
 import unicodedata
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from xrgs.config import SceneConf
 from xrgs.errors import UnreadableError, XrgsError
 from xrgs.photos import foreign, images
 from xrgs.photos.masks import WORDS
 from xrgs.photos.scenes.copies import SIZES, one_of_each_size, without_copies
-from xrgs.photos.scenes.made import is_mask, without_made
-from xrgs.photos.scenes.panoramas import without_panoramas
+from xrgs.photos.scenes.no_photographs import is_mask, without_made, without_panoramas
 from xrgs.photos.scenes.scene import ALL_BELOW, Scene, files_digest, label, remembered
 from xrgs.runtime.text import listed
 from xrgs.safeio.files import is_name
 from xrgs.safeio.paths import user_path
 from xrgs.safeio.sanitize import counted, for_line
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
-
-    from xrgs.config import SceneConf
 
 #: Suffixes of images that are not read: raw files, stereo pairs and pictures of two fisheye lenses
 #: in one file, thumbnails, and formats that no camera of today writes.
