@@ -5,11 +5,6 @@ from __future__ import annotations
 from xrgs.mixture.sampling_rate import Measures
 
 
-class Distance:
-    """The policy `distance`."""
-
-    needs_depth = True
-
-    def score(self, view: Measures) -> float:
-        """Return 1 / depth."""
-        return 1 / view.depth
+def distance(view: Measures) -> float:
+    """Return 1 / depth."""
+    return 1 / view.depth

@@ -5,12 +5,7 @@ from __future__ import annotations
 from xrgs.mixture.sampling_rate import Measures
 
 
-class Megapixels:
-    """The policy `megapixels`."""
-
-    needs_depth = False
-
-    def score(self, view: Measures) -> float:
-        """Return the pixel count of the original photograph."""
-        width, height = view.size
-        return float(width * height)
+def megapixels(view: Measures) -> float:
+    """Return the pixel count of the original photograph."""
+    width, height = view.size
+    return float(width * height)
