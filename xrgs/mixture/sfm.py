@@ -110,10 +110,8 @@ def reconstruct(
     Returns:
         The largest model; empty if COLMAP found none.
     """
-    _log_to(work)
-    pycolmap.set_random_seed(conf.seed)
     database = work / "database.db"
-    features = _find_matches(sfm_images, folder, work, conf)
+    features = _find_matches(sfm_images, folder, database, conf)
     models = _map(sfm_images, folder, database, work, conf)
     report = features | {
         "images": len(sfm_images),
@@ -161,10 +159,8 @@ def triangulate(
     Each image has `K` and its own camera, and `viewmats` its world to camera [4, 4]; the rest is as
     for `reconstruct`.
     """
-    _log_to(work)
-    pycolmap.set_random_seed(conf.seed)
     database = work / "database.db"
-    features = _find_matches(sfm_images, folder, work, conf)
+    features = _find_matches(sfm_images, folder, database, conf)
     index = {image.file: i for i, image in enumerate(sfm_images)}
     posed = pycolmap.Reconstruction()
     with pycolmap.Database.open(database) as opened:
@@ -179,17 +175,21 @@ def triangulate(
 
 
 def _find_matches(
-    sfm_images: Sequence[SfmImage], folder: Path, work: Path, conf: SfmConf
+    sfm_images: Sequence[SfmImage], folder: Path, database: Path, conf: SfmConf
 ) -> dict[str, Any]:
-    """Fill the database in `work` unless it is already filled; return the settings of SIFT."""
-    database = work / "database.db"
+    """Fill a database unless it is already filled; return the settings of SIFT.
+
+    The seed is set, and logs go to the folder of the database.
+    """
+    _log_to(database.parent)
+    pycolmap.set_random_seed(conf.seed)
     max_features = features_per_image(len(sfm_images), conf.max_num_features)
     longest = max(max(images.size(folder / image.file)) for image in sfm_images)
     octave = first_octave(longest, conf.first_octave)
     if not database.exists():
         _name_cameras(sfm_images, folder, database)
         _extract(sfm_images, folder, database, max_features, octave)
-        _match(sfm_images, database, work, conf.seed)
+        _match(sfm_images, database, conf.seed)
     return {"first_octave": octave, "max_num_features": max_features}
 
 
@@ -295,19 +295,19 @@ def _batches(sfm_images: Sequence[SfmImage], size: int) -> Iterator[list[SfmImag
             yield group[start : start + size]
 
 
-def _match(sfm_images: Sequence[SfmImage], database: Path, work: Path, seed: int) -> None:
+def _match(sfm_images: Sequence[SfmImage], database: Path, seed: int) -> None:
     """Match every pair of images: each image with all images before it."""
     matching = pycolmap.FeatureMatchingOptions()
     matching.num_threads = usable_cores()
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed  # of each pair, on any thread
     pairing = pycolmap.ImportedPairingOptions()
-    pairing.match_list_path = work / "pairs.txt"
+    pairing.match_list_path = listed_pairs = database.with_name("pairs.txt")
     pairs = len(sfm_images) * (len(sfm_images) - 1) // 2
     with ProgressBar("SfM: matches", "pair", pairs) as bar:
         for i in range(1, len(sfm_images)):
             lines = [f"{image.file} {sfm_images[i].file}\n" for image in sfm_images[:i]]
-            (work / "pairs.txt").write_text("".join(lines), encoding="utf-8")
+            listed_pairs.write_text("".join(lines), encoding="utf-8")
             pycolmap.match_image_pairs(
                 database,
                 matching_options=matching,
@@ -383,19 +383,12 @@ def to_numpy(model: Any, index: Mapping[str, int], report: Mapping[str, Any]) ->
         lenses[i] = lens_of_model(camera.model_name, (camera.width, camera.height), params)
         own = {number[p.point3D_id] for p in image.points2D if p.has_point3D()}
         observed[i] = np.array(sorted(own), dtype=np.intp)
-    points, colors = points_of(model)
+    points = np.array([model.points3D[p].xyz for p in order], dtype=np.float64).reshape(-1, 3)
+    colors = np.array([model.points3D[p].color for p in order], dtype=np.uint8).reshape(-1, 3)
     results: dict[str, Any] = {"registered": len(viewmats), "points": len(points)}
     if model.compute_num_observations():  # models of other programs may have no observations
         results["reprojection_error_px"] = reprojection_error(model)
     return Reconstruction(lenses, viewmats, points, colors, observed, {**report, **results})
-
-
-def points_of(model: Any) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Return points [P, 3] and colours [P, 3] of pycolmap's `Reconstruction`, sorted by id."""
-    order = sorted(model.points3D)
-    points = np.array([model.points3D[p].xyz for p in order], dtype=np.float64).reshape(-1, 3)
-    colors = np.array([model.points3D[p].color for p in order], dtype=np.uint8).reshape(-1, 3)
-    return points, colors
 
 
 def other_cameras(model: Any, cameras: Mapping[str, tuple[int, str]]) -> dict[int, int]:

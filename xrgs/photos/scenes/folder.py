@@ -187,7 +187,7 @@ def _all_below(folder: Path, long_side: int, masks: Path | None) -> _Found:
     dropped, notes = _other_sizes(tree, long_side)
     root = folder.resolve()
     for what in sorted(passed.keys() - {_MASKS}):
-        own = [inside for inside in passed[what] if not _is_link_into(inside, root)]
+        own = [f for f in passed[what] if what != _LINKS or not f.resolve().is_relative_to(root)]
         notes += _left_out({inside: _count_anywhere(inside) for inside in own}, folder, what)
     return _Found(
         {inside: files for inside, files in tree.items() if inside not in dropped},
@@ -245,10 +245,6 @@ def _made_by_programs(folder: Path) -> str:
         return "made of photographs, by the folder's name"
     found = (what for what, names in _MADE.items() if all((folder / n).exists() for n in names))
     return next(found, "")
-
-
-def _is_link_into(inside: Path, root: Path) -> bool:
-    return inside.is_symlink() and inside.resolve().is_relative_to(root)
 
 
 def _count_anywhere(folder: Path) -> int:

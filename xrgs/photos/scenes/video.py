@@ -15,6 +15,7 @@ compares the lines of each frame with its neighbours, and marks those of two fie
 from __future__ import annotations
 
 import logging
+from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import partial
@@ -118,16 +119,24 @@ def _notes(file: Path) -> tuple[str, ...]:
     import av
 
     try:
-        with (
-            file.open("rb") as stream,
-            av.open(stream, "r", options={"format_whitelist": _CONTAINERS}) as container,
-        ):
+        with _opened(file) as container:
             count = len(_streams(container))
     except (av.FFmpegError, OSError):
         return ()
     if count < 2:
         return ()
     return (f"the first of the {count} video streams of {file.name} is read, and no other",)
+
+
+@contextmanager
+def _opened(file: Path) -> Iterator[InputContainer]:
+    import av
+
+    with (
+        file.open("rb") as stream,
+        av.open(stream, "r", options={"format_whitelist": _CONTAINERS}) as container,
+    ):
+        yield container
 
 
 def _streams(container: InputContainer) -> list[VideoStream]:
@@ -200,10 +209,7 @@ def _frames(file: Path) -> Iterator[_Frame]:
 
     number = 0
     try:
-        with (
-            file.open("rb") as stream,
-            av.open(stream, "r", options={"format_whitelist": _CONTAINERS}) as container,
-        ):
+        with _opened(file) as container:
             if not (streams := _streams(container)):
                 raise images.ImageError(f"{file}: it has no video")
             video = streams[0]
