@@ -71,7 +71,7 @@ class ProceduralScene:
             from xrgs.photos.scenes import still_life  # imports torch
 
             size = camera_size(long_side)
-            still_life.render(folder, TEXTURES, intrinsics(*size), size, exact)
+            still_life.render_views(folder, TEXTURES, intrinsics(*size), size, exact)
 
         files = rendered.provide(home, list(exact), render)
         # The intrinsics are known too, but SfM estimates them, as for a real capture.
