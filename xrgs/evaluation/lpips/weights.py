@@ -177,8 +177,7 @@ def load(file: Path, network: Network = ALEX) -> Weights:
     try:
         content = read_bytes(file, _MAX_BYTES)
     except OSError as error:
-        hint = "" if network is ALEX else f"; {network.fetch_hint}"
-        raise WeightsError(f"{file}: can't be read ({error}){hint}") from error
+        raise WeightsError(f"{file}: can't be read ({error}); {network.fetch_hint}") from error
     return from_bytes(content, str(file), network)
 
 
