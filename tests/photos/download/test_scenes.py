@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 from xrgs import config
-from xrgs.photos.download import unpack as unpack_module
+from xrgs.photos.download import scenes as scenes_module
 from xrgs.photos.download.scenes import UnpackError, unpack
 
 Run = Callable[..., tuple[int, str, str]]
@@ -237,7 +237,7 @@ def test_a_file_larger_than_declared_is_refused(tmp_path: Path) -> None:
 def test_too_many_files_or_bytes_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str
 ) -> None:
-    monkeypatch.setattr(unpack_module, limit, 1)
+    monkeypatch.setattr(scenes_module, limit, 1)
     with pytest.raises(UnpackError, match="unpacks to 2 files and 51 bytes; at most"):
         unpack(archive(tmp_path), "set/fern", tmp_path / "fern")
 
