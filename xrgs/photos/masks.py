@@ -11,7 +11,7 @@ import unicodedata
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,6 @@ from xrgs.safeio.paths import user_path
 Mask = NDArray[np.bool_]  # [H, W], True for a pixel that is used
 
 _T = TypeVar("_T", np.float32, np.uint8)
-_M = TypeVar("_M", Mask, None)
 #: The folder of masks in a folder of copies, as COLMAP expects it.
 MASKS = "masks"
 #: Words for masks in names of files and folders.
@@ -214,7 +213,11 @@ def _same_shape(one: tuple[int, int], other: tuple[int, int]) -> bool:
     return abs(h - height * w / width) < 1 or abs(w - width * h / height) < 1
 
 
-def resized(mask: _M, width: int, height: int) -> _M:
+@overload
+def resized(mask: Mask, width: int, height: int) -> Mask: ...
+@overload
+def resized(mask: None, width: int, height: int) -> None: ...
+def resized(mask: Mask | None, width: int, height: int) -> Mask | None:
     """Resize a mask [H, W]: a pixel is used if nearly all of its source pixels are used."""
     if mask is None or mask.shape == (height, width):
         return mask

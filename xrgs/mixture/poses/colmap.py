@@ -306,7 +306,8 @@ class _Binary:
 
 
 def _binary_cameras(file: Path) -> dict[int, _Camera]:
-    data, names, cameras = _Binary(file), list(MODELS), {}
+    data, names = _Binary(file), list(MODELS)
+    cameras: dict[int, _Camera] = {}
     for _ in range(data.count(24)):
         number, model, width, height = map(int, data.values("IiQQ"))
         if not 0 <= model < len(names):
@@ -344,7 +345,7 @@ def _binary_points(file: Path) -> _Points:
 
 
 def _text_cameras(file: Path) -> dict[int, _Camera]:
-    cameras = {}
+    cameras: dict[int, _Camera] = {}
     for number, line in _lines(file):
         if line:
             with _line(file, number, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS"):
