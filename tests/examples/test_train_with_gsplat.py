@@ -19,7 +19,7 @@ from PIL import Image
 
 from tests import reference_store as reference
 from xrgs import Gaussians, Store
-from xrgs.evaluation.files import score_file
+from xrgs.evaluation.protocol import score_file
 from xrgs.formats.gsplat_api import rasterization
 
 

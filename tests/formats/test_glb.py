@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from xrgs.errors import XrgsError
 from xrgs.formats.glb import read_glb, write_glb
 from xrgs.formats.ply import load_ply
-from xrgs.formats.similarity import transformed
+from xrgs.formats.saved import transformed
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.splat.quaternions import rotation_matrices
 from xrgs.splat.sh import sh_to_colors

@@ -15,7 +15,7 @@ import torch
 
 from xrgs.errors import XrgsError
 from xrgs.formats.ply import load_ply
-from xrgs.formats.similarity import transformed
+from xrgs.formats.saved import transformed
 from xrgs.formats.spz import read_spz, write_spz
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
 

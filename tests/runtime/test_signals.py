@@ -72,7 +72,7 @@ os.kill(os.getpid(), signal.{name})
     for imports, name, thread, said in (
         ("from xrgs.mixture import sfm", "SIGTERM", 0, ""),
         ("from xrgs.mixture import colmap", "SIGTERM", 1, ""),
-        ("from xrgs.mixture import own_cameras", "SIGABRT", 0, "Fatal Py"),
+        ("from xrgs.mixture import sfm", "SIGABRT", 0, "Fatal Py"),
         (f"from xrgs.photos.lens import Lens; {distorted}.kept()", "SIGTERM", 0, ""),
     ):
         done = subprocess.run(

@@ -77,9 +77,10 @@ def lpips(
         network: `alex`, used in every evaluation, or `vgg`, for `xrgs-store rescore --also
             lpips_vgg`.
     """
-    from xrgs.evaluation.lpips.download import fetch_vgg, fetch_weights
+    from xrgs.evaluation.lpips.download import fetch_weights
+    from xrgs.evaluation.lpips.weights import ALEX, VGG
 
-    say(fetch_weights(source) if network == "alex" else fetch_vgg(source))
+    say(fetch_weights(source, ALEX if network == "alex" else VGG))
 
 
 def inspect(

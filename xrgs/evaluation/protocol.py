@@ -14,6 +14,11 @@ import time
 from statistics import fmean, median
 from typing import TYPE_CHECKING, Any
 
+from xrgs.evaluation.metrics import score_view
+from xrgs.photos import images
+from xrgs.runtime.machine import single_torch_thread, wait_for_gpu
+from xrgs.runtime.progress import progress
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
@@ -21,6 +26,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from xrgs.config import SplatConf
+    from xrgs.mixture.views import View
     from xrgs.splat.gaussians import Gaussians
     from xrgs.training.dataset import LoadedView
 
@@ -42,9 +48,6 @@ def score_views(
         One row for each view: `view`, its name, and a column for each metric, None if the metric is
         not available.
     """
-    from xrgs.photos import images
-    from xrgs.runtime.progress import progress
-
     renders.mkdir(exist_ok=True)
     gaussians = _placed(gaussians, conf)
     rows, masked = [], _any_mask(views)
@@ -84,8 +87,6 @@ def render_time(gaussians: Gaussians, views: Sequence[LoadedView], conf: SplatCo
     Returns:
         The median over the views, ms.
     """
-    from xrgs.runtime.machine import wait_for_gpu
-
     gaussians, seconds = _placed(gaussians, conf), []
     for view in views:
         _render(gaussians, view, conf)
@@ -132,10 +133,22 @@ def _score(
     """Return the clamped render [H, W, 3] of a view, and its scores by name."""
     import torch
 
-    from xrgs.evaluation.metrics import score_view
-    from xrgs.runtime.machine import single_torch_thread
-
     image = _render(gaussians, view, conf).clamp(0.0, 1.0).cpu()
     with torch.no_grad(), single_torch_thread():  # the last digit of sums depends on threads
         scores = score_view(image, view.image, view.mask, masked=masked)
     return image, scores
+
+
+def score_file(render: Path, view: View, *, masked: bool) -> dict[str, float | None]:
+    """Score a render, an 8-bit RGB PNG of the view's size, by `xrgs.evaluation.metrics.score_view`.
+
+    Raises:
+        ImageError: A file is missing, damaged or of another size or mode; the message names it.
+    """
+    import torch
+
+    size = view.width, view.height
+    image, target = (torch.from_numpy(images.read_png(file, size)) for file in (render, view.file))
+    mask = torch.from_numpy(images.read_mask(view.mask, size)) if view.mask else None
+    with torch.no_grad(), single_torch_thread():
+        return score_view(image, target, mask, masked=masked)

@@ -7,10 +7,12 @@ instead. Unsupported arguments raise an error that names them.
 from __future__ import annotations
 
 import operator
+from collections.abc import Callable
 from functools import wraps
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, ParamSpec, TypeVar, get_args
+from typing import Any, Literal, NamedTuple, ParamSpec, TypeVar, get_args
 
 import torch
+from torch import Tensor
 from torch.nn.functional import pad
 
 import xrgs
@@ -21,11 +23,6 @@ from xrgs.splat.sh import C0, MAX_DEGREE, bases
 from xrgs.splat.torch.projection import depths as camera_depths
 from xrgs.splat.torch.projection import project
 from xrgs.splat.torch_defaults import on_cpu_in_float32
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from torch import Tensor
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")

@@ -9,17 +9,13 @@ the same view are needed.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from xrgs.mixture.views import View
 from xrgs.photos import images, masks
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from xrgs.mixture.views import View
 
 Array = NDArray[np.float64]
 

@@ -12,11 +12,12 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from xrgs.mixture import poses, sampling_rate, sfm_retries, triangulation
+from xrgs.config import VariantConf
+from xrgs.mixture import poses, sampling_rate, sfm_retries
 from xrgs.mixture.blur import blur_notes, lr_blur
 from xrgs.mixture.degradations import DEGRADATIONS, resolve_degradation
 from xrgs.mixture.photographs import PhotoCollection, prepare_hr_views, write_degraded
@@ -31,17 +32,13 @@ from xrgs.mixture.split import (
     split_notes,
 )
 from xrgs.mixture.tags import POLICIES
-from xrgs.mixture.views import SceneFailed, Variant, View
+from xrgs.mixture.views import Reconstruction, SceneFailed, Variant, View
 from xrgs.photos import images
 from xrgs.photos.lens import Lens
+from xrgs.photos.scenes import Scene
 from xrgs.runtime.progress import progress
 from xrgs.runtime.text import listed
 from xrgs.safeio.atomic import write_text
-
-if TYPE_CHECKING:
-    from xrgs.config import VariantConf
-    from xrgs.mixture.sfm import Reconstruction
-    from xrgs.photos.scenes import Scene
 
 #: Least ratio of the median sampling rates of HR and LR views without a note; our choice. The paper
 #: has a ratio of 5.
@@ -117,7 +114,7 @@ def _register(inputs: _Inputs, work: Path) -> Registration:
         model = poses.read_poses(conf.poses, photos)
         if not len(model.points):
             write_degraded(photos, inputs.degraded, conf)
-            model = triangulation.with_points(model, photos, inputs.degraded, conf.sfm, work)
+            model = sfm_retries.with_points(model, photos, inputs.degraded, conf.sfm, work)
         return Registration(model, _refusal(inputs, model), Attempt("given", conf.sfm), [])
     write_degraded(photos, inputs.degraded, conf, "sfm_lr")
     return sfm_retries.register(

@@ -9,16 +9,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from msgspec import Struct
 
 from xrgs.errors import StoreError
 from xrgs.safeio.files import is_name, list_names
 from xrgs.safeio.records import read_struct
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 _FAILED, _TRIMMED = "failed-", "trimmed-"
 #: Advice if SfM places too few photographs of a scene. Using all pixels is first, since it costs

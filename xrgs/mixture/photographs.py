@@ -7,24 +7,22 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from xrgs.config import VariantConf
 from xrgs.errors import UnreadableError, XrgsError
 from xrgs.mixture.degradations import DEGRADATIONS, resolve_degradation
 from xrgs.mixture.split import HrGeometry, TooSmallError, hr_geometry, shrink_factor
 from xrgs.photos import exif, images, masks
 from xrgs.photos.lens import Lens, lens_of_model, undistort
 from xrgs.photos.masks import MASKS, Mask, Masks, copy_mask
+from xrgs.photos.scenes import Scene
 from xrgs.runtime.progress import progress
 from xrgs.runtime.text import listed
 from xrgs.safeio.hashing import digest
-
-if TYPE_CHECKING:
-    from xrgs.config import VariantConf
-    from xrgs.photos.scenes import Scene
 
 #: Least average number of photographs for each size at which photographs without EXIF of the same
 #: size are assumed to be from one camera. Our choice.

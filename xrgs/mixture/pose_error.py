@@ -7,6 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from xrgs.splat.normalize import camera_positions
+
 Matrix = NDArray[np.float64]
 
 
@@ -55,7 +57,7 @@ def pose_error(estimated: Mapping[str, Matrix], exact: Mapping[str, Matrix]) -> 
     }
     if len(names) < 3:
         return error
-    centres, exact_centres = _centres(a), _centres(b)
+    centres, exact_centres = camera_positions(a), camera_positions(b)
     scale, rotation, shift = fit_similarity(centres, exact_centres)
     distance = np.linalg.norm(scale * centres @ rotation.T + shift - exact_centres, axis=1)
     extent = np.linalg.norm(exact_centres[:, None] - exact_centres[None], axis=-1).max()
@@ -64,9 +66,3 @@ def pose_error(estimated: Mapping[str, Matrix], exact: Mapping[str, Matrix]) -> 
         "position_percent": float(percent.mean()),
         "position_percent_max": float(percent.max()),
     }
-
-
-def _centres(viewmats: Matrix) -> Matrix:
-    """Compute the camera centres [N, 3] of world-to-camera matrices [N, 4, 4]."""
-    centres: Matrix = -np.einsum("nji,nj->ni", viewmats[:, :3, :3], viewmats[:, :3, 3])
-    return centres

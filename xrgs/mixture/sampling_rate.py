@@ -9,16 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from xrgs.errors import XrgsError
-
-if TYPE_CHECKING:
-    from xrgs.mixture.sfm import Reconstruction
-    from xrgs.photos.lens import Lens
+from xrgs.mixture.views import Reconstruction
+from xrgs.photos.lens import Lens
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -9,15 +9,18 @@ for given poses, the transform from their world. `report.json` has the results o
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
 from msgspec import Meta, Struct
+from numpy.typing import NDArray
 
 from xrgs.errors import StoreError, UnreadableError, XrgsError
-from xrgs.mixture.views import Variant, View
+from xrgs.mixture.views import MIN_POINTS, Variant, View
 from xrgs.safeio import checksums, npz
 from xrgs.safeio.atomic import atomic_writer, write_json
 from xrgs.safeio.files import sync_name, sync_tree
@@ -25,15 +28,7 @@ from xrgs.safeio.hashing import digest
 from xrgs.safeio.records import errors_named, read_struct
 from xrgs.safeio.sanitize import for_line
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
 MANIFEST, POINTS, REPORT, LOG = "variant.json", "points.npz", "report.json", "colmap.log"
-#: Least number of points, since the initial scale of a Gaussian needs its three nearest points.
-_MIN_POINTS = 4
 #: Largest coordinate of a point, whose square must fit in float32.
 _MAX_COORDINATE = 1e12
 
@@ -198,8 +193,8 @@ def _assembled(folder: Path, manifest: Manifest) -> Variant:
         raise StoreError(
             f"damaged: {file}: points: {points.dtype} {points.shape}, not float64 [P, 3]"
         )
-    if len(points) < _MIN_POINTS:
-        raise StoreError(f"damaged: {file}: points: {len(points)}, at least {_MIN_POINTS} needed")
+    if len(points) < MIN_POINTS:
+        raise StoreError(f"damaged: {file}: points: {len(points)}, at least {MIN_POINTS} needed")
     if colors.dtype != np.uint8 or colors.shape != points.shape:
         raise StoreError(
             f"damaged: {file}: colors: {colors.dtype} {colors.shape}, not uint8 [P, 3]"

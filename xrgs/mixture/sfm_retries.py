@@ -12,7 +12,7 @@ also made if `configured` is accepted but lacks views. If EXIF gives a focal len
 attempts use as the initial value, an attempt without it is made after the first fallback.
 
 Photographs that were cropped or zoomed may keep their EXIF, and so share a camera with the others.
-If views of the best reconstruction fit better with another camera (`xrgs.mixture.own_cameras`), the
+If views of the best reconstruction fit better with another camera (`sfm.other_cameras`), the
 attempt `cameras_apart` gives them one.
 """
 
@@ -23,17 +23,17 @@ import math
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
+from xrgs.config import SfmConf
+from xrgs.errors import XrgsError
 from xrgs.mixture import sfm
-from xrgs.photos.masks import copy_mask
+from xrgs.mixture.photographs import PhotoCollection
+from xrgs.mixture.views import MIN_POINTS, Reconstruction
+from xrgs.photos import images, masks
+from xrgs.runtime.progress import progress
 from xrgs.runtime.text import listed
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from xrgs.config import SfmConf
-    from xrgs.mixture.photographs import PhotoCollection
 
 _log = logging.getLogger(__name__)
 
@@ -100,7 +100,7 @@ FALLBACKS = (relaxed, finer, narrower, other_size)
 class Registration:
     """The best reconstruction, and a report of every attempt."""
 
-    model: sfm.Reconstruction
+    model: Reconstruction
     refused: str
     """Why the best reconstruction is not accepted; empty if it is accepted."""
     attempt: Attempt
@@ -114,7 +114,7 @@ def register(
     degraded: Collection[int],
     conf: SfmConf,
     work: Path,
-    refusal: Callable[[sfm.Reconstruction], str],
+    refusal: Callable[[Reconstruction], str],
 ) -> Registration:
     """Run SfM on the mixed-resolution images, until a reconstruction is accepted.
 
@@ -129,11 +129,11 @@ def register(
         The accepted reconstruction with the most registered views; if none is accepted, the
         refused one with the most. Of equal ones, the first.
     """
-    best: tuple[sfm.Reconstruction, str, Attempt] | None = None
+    best: tuple[Reconstruction, str, Attempt] | None = None
     reports: list[dict[str, Any]] = []
     folders: dict[tuple[object, ...], Path] = {}
 
-    def run(attempt: Attempt) -> tuple[sfm.Reconstruction, str, Attempt]:
+    def run(attempt: Attempt) -> tuple[Reconstruction, str, Attempt]:
         start = time.perf_counter()
         # Attempts with the same features and matches share a folder, so that COLMAP reuses them.
         folder = folders.setdefault(_features_of(attempt), work / f"sfm-{attempt.name}")
@@ -168,7 +168,7 @@ def register(
     return Registration(model, reason, attempt, reports)
 
 
-def _error(model: sfm.Reconstruction) -> float:
+def _error(model: Reconstruction) -> float:
     return float(model.report.get("reprojection_error_px", math.inf))
 
 
@@ -189,7 +189,7 @@ def _notes(attempt: Attempt, photos: PhotoCollection) -> Iterator[str]:
         )
 
 
-def _rank(model: sfm.Reconstruction, refused: str) -> tuple[bool, int]:
+def _rank(model: Reconstruction, refused: str) -> tuple[bool, int]:
     return not refused, len(model.viewmats)
 
 
@@ -240,7 +240,7 @@ def sfm_images(
         if i in attempt.apart:
             camera += f" {attempt.apart[i]}"
         file, K = photos.file(kind, i), lens.K if lens else None
-        masked = copy_mask(photos.folder, file).exists()
+        masked = masks.copy_mask(photos.folder, file).exists()
         result.append(sfm.SfmImage(file, photo.name, camera, K, focal, masked))
     return result
 
@@ -251,7 +251,7 @@ def _kind(index: int, degraded: Collection[int]) -> str:
 
 def _reconstruct(
     photos: PhotoCollection, degraded: Collection[int], attempt: Attempt, work: Path
-) -> sfm.Reconstruction:
+) -> Reconstruction:
     """Run SfM once, and convert the cameras to those of the HR views."""
     work.mkdir(exist_ok=True)
     given = sfm_images(photos, degraded, attempt)
@@ -260,8 +260,50 @@ def _reconstruct(
     return replace(model, lenses=lenses)
 
 
-def reconstruct_undegraded(
-    photos: PhotoCollection, attempt: Attempt, work: Path
-) -> sfm.Reconstruction:
+def reconstruct_undegraded(photos: PhotoCollection, attempt: Attempt, work: Path) -> Reconstruction:
     """Run SfM once on the undegraded photographs, with the settings of an attempt."""
     return _reconstruct(photos, (), attempt, work / "sfm-reference")
+
+
+def with_points(
+    model: Reconstruction,
+    photos: PhotoCollection,
+    degraded: Collection[int],
+    conf: SfmConf,
+    work: Path,
+) -> Reconstruction:
+    """Triangulate points for a model that has only cameras, of HR views.
+
+    As in SfM, LR views are degraded, and resized to the size of their HR views: `photos` needs `hr`
+    copies, and `lr` copies of the degraded views. `work` is an existing folder for temporary files.
+    XrgsError if too few points are found.
+    """
+    folder, order = work / "triangulation", sorted(model.viewmats)
+    (folder / masks.MASKS).mkdir(parents=True)
+    given = []
+    for i in progress(order, "undistorting", "view"):
+        lens, kind = model.lenses[i], "lr" if i in degraded else "hr"
+        image, mask = photos.undistorted(kind, i, lens.resized(*photos.size(kind, i)))
+        file = f"{photos[i].number}.png"
+        images.save(folder / file, images.resize(image, lens.width, lens.height), durable=False)
+        if mask is not None:
+            resized = masks.resized(mask, lens.width, lens.height)
+            images.save_mask(masks.copy_mask(folder, file), resized, durable=False)
+        name, K = photos[i].name, lens.undistorted().K
+        given.append(sfm.SfmImage(file, name, name, K, masked=mask is not None))
+    found = sfm.triangulate(given, [model.viewmats[i] for i in order], folder, folder, conf)
+    count = len(found.points)
+    if count < MIN_POINTS:
+        raise XrgsError(
+            f"variant.poses has no points, and {count} were found in the photographs with its "
+            "poses: are these the poses of these photographs? Points of a .ply can be named as "
+            "ply_file_path in a transforms.json"
+        )
+    note = f"variant.poses has no points: {count} were triangulated from the photographs"
+    return replace(
+        model,
+        points=found.points,
+        colors=found.colors,
+        observed={i: found.observed[n] for n, i in enumerate(order)},
+        report=model.report | found.report | {"notes": [*model.report["notes"], note]},
+    )

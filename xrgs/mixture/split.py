@@ -8,18 +8,15 @@ from collections.abc import Sequence, Set
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from operator import attrgetter
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from xrgs.config import VariantConf
 from xrgs.errors import XrgsError
 from xrgs.mixture.degradations import DEGRADATIONS
 from xrgs.mixture.sampling_rate import Measures, not_placed, relative_to_largest
 from xrgs.mixture.tags import POLICIES
 from xrgs.splat.settings import SSIM_WINDOW
-
-if TYPE_CHECKING:
-    from xrgs.config import VariantConf
 
 #: Largest `variant.phone.blur`, LR px: more than the blur of a lens or a moving hand. Our choice.
 _MOST_BLUR = 10

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import logging
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
-from xrgs.config import identity_values
+from xrgs.config import SceneConf, VariantConf, identity_values
 from xrgs.errors import StoreError, UnreadableError
 from xrgs.mixture import paths, poses, split
 from xrgs.mixture.degradations import DEGRADATIONS, resolve_degradation
@@ -26,11 +27,6 @@ from xrgs.safeio.files import remove_path
 from xrgs.safeio.hashing import digest
 from xrgs.safeio.records import list_folder
 from xrgs.safeio.refactorings import canonical
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from xrgs.config import SceneConf, VariantConf
 
 __all__ = [
     "CorruptVariant",

@@ -1,7 +1,8 @@
-"""The dataclasses of a variant: its views, cameras and points."""
+"""The dataclasses of a variant and of SfM: views, cameras and points."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from xrgs.errors import XrgsError
+from xrgs.photos.lens import Lens
+
+#: Least number of points, since the initial scale of a Gaussian needs its three nearest points.
+MIN_POINTS = 4
 
 
 class SceneFailed(XrgsError):  # noqa: N818
@@ -79,3 +84,26 @@ class Variant:
     """Results of SfM: registered views, points, reprojection error, every attempt."""
     world: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
     """The rigid transform [4, 4] from the world of given poses to the world of views and points."""
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """COLMAP's largest model; empty if there is none. Keys are indices of images."""
+
+    lenses: dict[int, Lens]
+    """Registered image -> its camera, in px of the image."""
+    viewmats: dict[int, NDArray[np.float64]]
+    """Registered image -> world to camera [4, 4], OpenCV axes."""
+    points: NDArray[np.float64]
+    """SfM points [P, 3]."""
+    colors: NDArray[np.uint8]
+    """Colours of the points [P, 3]."""
+    observed: dict[int, NDArray[np.intp]]
+    """Registered image -> ascending indices of its observed points."""
+    report: dict[str, Any]
+    """Settings and results, with the keys of the variant's report."""
+    world: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
+    """The rigid transform [4, 4] from the world of given poses to the world of `viewmats`."""
+    apart: Mapping[int, int] = field(default_factory=dict)
+    """Image that fits better with another camera than the shared one -> number of that camera
+    (`xrgs.mixture.sfm.other_cameras`)."""

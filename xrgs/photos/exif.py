@@ -8,12 +8,10 @@ from __future__ import annotations
 import re
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 from xrgs.photos import images
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 _MAKE, _MODEL = 0x010F, 0x0110
 _FOCAL, _FOCAL_35MM = 0x920A, 0xA405  # mm; the second is the 35 mm equivalent

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
 from xrgs.errors import XrgsError
 from xrgs.runtime.text import listed
 from xrgs.safeio.files import list_names
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
 
 _AS_COLMAP = "export the cameras in COLMAP's format from the program that made it"
 _UNPACK = "unpack it, and give the folder"

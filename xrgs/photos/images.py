@@ -19,7 +19,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,9 +30,6 @@ from xrgs.errors import UnreadableError, XrgsError
 from xrgs.photos import colour, tiff
 from xrgs.safeio.atomic import atomic_writer
 from xrgs.safeio.files import is_transient
-
-if TYPE_CHECKING:
-    from typing import BinaryIO
 
 ImageArray = NDArray[np.float32]  # [H, W, 3]
 
@@ -100,10 +97,6 @@ class ImageError(XrgsError):
     """A file can't be read as a photograph; the message begins with its path."""
 
 
-class _RefusedError(ValueError):
-    """An intact file that can't be used; the message says why."""
-
-
 # PIL's limit holds for the whole process, and refuses photographs that `MAX_PIXELS` admits.
 if Image.MAX_IMAGE_PIXELS is not None:
     Image.MAX_IMAGE_PIXELS = max(Image.MAX_IMAGE_PIXELS, MAX_PIXELS)
@@ -118,7 +111,7 @@ def _stream(path: Path) -> Iterator[BinaryIO]:
             yield stream
     except MemoryError:
         raise
-    except (_RefusedError, colour.ColourError, tiff.DepthError) as error:
+    except (tiff.RefusedError, colour.ColourError) as error:
         raise ImageError(f"{path}: {error}") from error
     except UnidentifiedImageError as error:
         why = f"cannot identify it as one of {', '.join(_FORMATS)}"
@@ -145,7 +138,7 @@ def _check_size(
     """
     width, height = size
     if width * height > max_pixels:
-        raise _RefusedError(
+        raise tiff.RefusedError(
             f"it has {width} x {height} pixels; at most {max_pixels} in all are read"
         )
     file_bytes = stream.seek(0, 2)
@@ -153,25 +146,27 @@ def _check_size(
     if drawing and width * height <= _SMALL_PIXELS:
         return
     if bits * width * height > 8 * _MAX_EXPANSION * file_bytes:
-        raise _RefusedError(f"{file_bytes} bytes are too few for {width} x {height} px")
+        raise tiff.RefusedError(f"{file_bytes} bytes are too few for {width} x {height} px")
 
 
 def _formats(start: bytes, suffix: str) -> tuple[str, ...]:
     """Return the formats that PIL tries on a file with these first bytes; enable HEIF for HEIC."""
     for magic, name in _OTHER_FORMATS.items():
         if start.startswith(magic):
-            raise _RefusedError(f"it is {name}, which is not read; convert it to PNG or JPEG")
+            raise tiff.RefusedError(f"it is {name}, which is not read; convert it to PNG or JPEG")
     if start[4:8] != _HEIF_MAGIC:
         others = tuple(name for name in _FORMATS if name not in ("HEIF", "AVIF"))
         return (*others, "TGA") if suffix.lower() in _TGA else others
     if start[8:12] in _AVIF_BRANDS:
         if not features.check("avif"):
-            raise _RefusedError("it is AVIF, which this Pillow does not read; install a newer one")
+            raise tiff.RefusedError(
+                "it is AVIF, which this Pillow does not read; install a newer one"
+            )
         return ("AVIF",)
     try:
         from pillow_heif import register_heif_opener
     except ImportError as error:
-        raise _RefusedError("HEIC needs pillow-heif: pip install 'xrgs[heic]'") from error
+        raise tiff.RefusedError("HEIC needs pillow-heif: pip install 'xrgs[heic]'") from error
     register_heif_opener()
     return ("HEIF",)
 
@@ -552,12 +547,12 @@ def read_png_pil(
     """Read a PNG as `read_png` does, into an image of PIL of mode RGB, or L for grey."""
     with _stream(path) as stream, Image.open(stream, formats=("PNG",)) as image:
         if size is not None and image.size != size:
-            raise _RefusedError(
+            raise tiff.RefusedError(
                 f"it has {image.width} x {image.height} pixels, not {size[0]} x {size[1]}"
             )
         if image.mode != mode:
             kind = "RGB" if mode == "RGB" else "grey"
-            raise _RefusedError(f"its pixels are {image.mode}, not 8-bit {kind}")
+            raise tiff.RefusedError(f"its pixels are {image.mode}, not 8-bit {kind}")
         _check_size(stream, image.size, max_pixels, _BITS.get(image.mode, 24), drawing=False)
         image.load()
         return image

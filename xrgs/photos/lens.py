@@ -5,20 +5,16 @@ Nothing here imports pycolmap before a lens with distortion is used.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from xrgs.errors import XrgsError
+from xrgs.photos.images import ImageArray
 from xrgs.runtime.signals import handlers_kept
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from xrgs.photos.images import ImageArray
 
 #: COLMAP's camera models -> their parameters: focal length, principal point, terms of distortion.
 #: The models' numbers in binary files count from 0 in this order.

@@ -11,21 +11,18 @@ import unicodedata
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar, overload
+from typing import TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from xrgs.errors import UnreadableError, XrgsError
 from xrgs.photos import images
-from xrgs.photos.lens import undistort
+from xrgs.photos.images import Header
+from xrgs.photos.lens import Lens, undistort
 from xrgs.runtime.text import listed
 from xrgs.safeio.files import walk_files
 from xrgs.safeio.paths import user_path
-
-if TYPE_CHECKING:
-    from xrgs.photos.images import Header
-    from xrgs.photos.lens import Lens
 
 Mask = NDArray[np.bool_]  # [H, W], True for a pixel that is used
 

@@ -9,13 +9,10 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
-
-if TYPE_CHECKING:
-    from typing import BinaryIO
 
 _WHITE = 65535
 #: If no 16-bit value is larger, the file uses 14 bits or fewer, like cameras' sensors.
@@ -29,8 +26,8 @@ _UNSPECIFIED, _ASSOCIATED = 0, 1  # TIFF's ExtraSamples: no alpha, premultiplied
 _SIGNED, _FLOAT = 2, 3  # TIFF's SampleFormat
 
 
-class DepthError(ValueError):
-    """The values of an image have no known white."""
+class RefusedError(ValueError):
+    """An intact file that can't be used; the message says why."""
 
 
 @dataclass(frozen=True)
@@ -127,19 +124,19 @@ class Tiff:
         """Decode the pixels as stored, before EXIF's turn.
 
         Raises:
-            DepthError: Values are float, signed or of more than 16 bits, or colours are not grey,
+            RefusedError: Values are float, signed or of more than 16 bits, or colours are not grey,
                 RGB or CMYK.
         """
         page = self._page
         bits, photometric = self.bits, int(page.photometric)
         if page.sampleformat in (_SIGNED, _FLOAT) or bits > 16:
             kind = {_SIGNED: "signed", _FLOAT: "float"}.get(page.sampleformat, "unsigned")
-            raise DepthError(
+            raise RefusedError(
                 f"{kind} values of {bits} bits have no white; save it with 8 or 16 bits"
             )
         if photometric not in _COLOURS:
             name = getattr(page.photometric, "name", photometric)
-            raise DepthError(f"{name} colours of {bits} bits are not read; save it as RGB")
+            raise RefusedError(f"{name} colours of {bits} bits are not read; save it as RGB")
         ends = [a + b for a, b in zip(page.dataoffsets, page.databytecounts, strict=True)]
         if not all(page.databytecounts) or max(ends) > self._stream.seek(0, 2):
             raise ValueError("image file is truncated")
@@ -176,7 +173,7 @@ def _scaled(colours: NDArray[Any], white: int, largest: int) -> tuple[NDArray[np
     note = ""
     if white == _WHITE and most <= _LARGEST_OF_14_BITS:
         if not most <= largest < white:
-            raise DepthError(
+            raise RefusedError(
                 f"its largest value is {most} of {white}, so that it has {most.bit_length()} bits "
                 "in 16 and would be too dark; scale its values to 16 bits"
             )

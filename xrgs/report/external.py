@@ -15,8 +15,8 @@ import msgspec
 import pandas as pd
 from msgspec import Meta
 
-from xrgs.evaluation.files import score_file
 from xrgs.evaluation.metrics import VIEW_METRICS
+from xrgs.evaluation.protocol import score_file
 from xrgs.mixture import variant
 from xrgs.photos.images import ImageError
 from xrgs.report.collect import ReportError, Sweep

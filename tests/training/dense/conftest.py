@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch.nn.functional import avg_pool2d
 
-from xrgs.photos.scenes import procedural, raycast, still_life
+from xrgs.photos.scenes import procedural, still_life
 from xrgs.splat.cameras import Camera
 from xrgs.splat.normalize import normalize_scene
 from xrgs.training.dataset import Dataset, LoadedView
@@ -45,7 +45,7 @@ def true_depths(rays: Array, viewmat: Array) -> Array:
     turn, shift = viewmat[:3, :3], viewmat[:3, 3]
     nearest = np.full(rays.shape[:2], np.inf)
     for solid in still_life.solids():
-        if isinstance(solid, raycast.Ball):
+        if isinstance(solid, still_life.Ball):
             centre = turn @ solid.centre.double().numpy() + shift
             square, along = (rays**2).sum(axis=-1), rays @ centre
             root = along**2 - square * (centre @ centre - solid.radius**2)
@@ -70,7 +70,7 @@ def true_scene(count: int, width: int) -> TrueScene:
     K, viewmats = procedural.intrinsics(width, height), procedural.viewmats(count)
     textures = {name: still_life._pyramid(*of) for name, of in procedural.TEXTURES.items()}
     images = [
-        raycast.render(
+        still_life.render(
             *(still_life.solids(), textures, torch.from_numpy(K), torch.from_numpy(viewmat)),
             *(width, height),
         )

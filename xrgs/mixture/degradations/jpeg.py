@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import numpy as np
 
+from xrgs.config import VariantConf
 from xrgs.photos import images
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from xrgs.config import VariantConf
-    from xrgs.photos.images import ImageArray
+from xrgs.photos.images import ImageArray
 
 
 def jpeg(high: ImageArray, conf: VariantConf, _rng: np.random.Generator) -> ImageArray:

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from PIL import Image
 
-if TYPE_CHECKING:
-    from xrgs.config import VariantConf
-    from xrgs.photos.images import ImageArray
+from xrgs.config import VariantConf
+from xrgs.photos.images import ImageArray
 
 
 def lanczos(high: ImageArray, conf: VariantConf, _rng: np.random.Generator) -> ImageArray:

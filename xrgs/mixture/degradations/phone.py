@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
+from xrgs.config import VariantConf
 from xrgs.photos import images
-
-if TYPE_CHECKING:
-    from xrgs.config import VariantConf
-    from xrgs.photos.images import ImageArray
+from xrgs.photos.images import ImageArray
 
 
 def phone(high: ImageArray, conf: VariantConf, rng: np.random.Generator) -> ImageArray:

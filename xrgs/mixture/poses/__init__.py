@@ -2,41 +2,42 @@
 
 The files are a COLMAP model or a transforms.json. A pose belongs to the photograph whose path ends
 with the same folders and name; suffixes are ignored.
-
-pycolmap is imported only to read cameras.
 """
 
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from difflib import get_close_matches
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from xrgs.errors import UnreadableError, XrgsError
-from xrgs.mixture.poses import checks, colmap, transforms, world
-from xrgs.mixture.poses.given import MIN_POINTS
+from xrgs.mixture.photographs import PhotoCollection, Photograph
+from xrgs.mixture.poses import colmap, transforms
+from xrgs.mixture.poses.given import (
+    check_camera,
+    check_places,
+    moved_points,
+    of_other_pictures,
+    own_world,
+    rounding,
+    same_shape,
+)
+from xrgs.mixture.views import MIN_POINTS, Reconstruction
 from xrgs.photos import foreign, images
 from xrgs.photos.lens import Lens, quarter_turn
+from xrgs.photos.scenes import Scene
 from xrgs.runtime.text import listed
 from xrgs.safeio.files import is_transient
 from xrgs.safeio.hashing import file_digest
 from xrgs.safeio.paths import user_path
 from xrgs.safeio.sanitize import for_line
 from xrgs.splat.normalize import camera_positions
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Mapping, Sequence
-
-    from numpy.typing import NDArray
-
-    from xrgs.mixture.photographs import PhotoCollection, Photograph
-    from xrgs.mixture.sfm import Reconstruction
-    from xrgs.photos.scenes import Scene
 
 #: EXIF orientation -> clockwise quarter turns of the stored pixels; other orientations mirror.
 _QUARTERS = {1: 0, 3: 2, 6: 1, 8: 3}
@@ -117,8 +118,6 @@ def read_poses(path: str, photos: PhotoCollection) -> Reconstruction:
         XrgsError: The files are malformed, a camera model is not supported, no photograph has the
             name of an image, or there are too few points (but none at all are accepted).
     """
-    from xrgs.mixture.sfm import Reconstruction
-
     content = fingerprint(path)
     with _errors_named(path):
         source = _source(path)
@@ -141,11 +140,11 @@ def read_poses(path: str, photos: PhotoCollection) -> Reconstruction:
         turned = _turned_by_exif({i: lens for i, (lens, _) in cameras.items()}, photos)
         cameras |= {i: _upright(*cameras[i], photos[i]) for i in turned}
         for i, (lens, _) in cameras.items():
-            checks.check_camera(lens, photos[i])
+            check_camera(lens, photos[i])
         given_lenses = {i: lens for i, (lens, _) in cameras.items()}
         names_of = {i: name for name, i in found.items()}
-        in_folder += checks.of_other_pictures(given_lenses, names_of, photos, user_path(path))
-        viewmats, moved = world.own_world({i: viewmat for i, (_, viewmat) in cameras.items()})
+        in_folder += of_other_pictures(given_lenses, names_of, photos, user_path(path))
+        viewmats, moved = own_world({i: viewmat for i, (_, viewmat) in cameras.items()})
         points, rounded = _moved_points(points, viewmats, moved)
         lenses = {i: photos[i].to_hr(lens) for i, (lens, _) in cameras.items()}
         kept = {i: lens.kept() for i, lens in lenses.items()}
@@ -178,8 +177,8 @@ def _moved_points(
 
     A note says if they were dropped.
     """
-    own, notes = world.moved_points(points, to), []
-    if step := world.rounding(points, own):
+    own, notes = moved_points(points, to), []
+    if step := rounding(points, own):
         far = float(np.abs(points).max())
         notes.append(
             f"the points of variant.poses are not used: 32 bits round them to steps of {step:.2g}, "
@@ -187,7 +186,7 @@ def _moved_points(
         )
         own = own[:0]
     centres = camera_positions(np.stack([*viewmats.values()]))
-    checks.check_places(centres, own, float(np.linalg.norm(to[:3, 3])))
+    check_places(centres, own, float(np.linalg.norm(to[:3, 3])))
     return own, notes
 
 
@@ -207,8 +206,8 @@ def _turned_by_exif(lenses: Mapping[int, Lens], photos: PhotoCollection) -> set[
     stored, upright, either = set[int](), set[int](), set[int]()
     for i, lens in lenses.items():
         shape, photo = (lens.width, lens.height), photos[i]
-        if photo.orientation != 1 and checks.same_shape(shape, _stored(photo)):
-            (either if checks.same_shape(shape, photo.size) else stored).add(i)
+        if photo.orientation != 1 and same_shape(shape, _stored(photo)):
+            (either if same_shape(shape, photo.size) else stored).add(i)
         elif photo.orientation != 1:
             upright.add(i)
     return stored if upright and not stored else stored | either

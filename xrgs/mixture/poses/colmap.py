@@ -35,11 +35,8 @@ _FEATURE = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<u8")])
 _TRACK_BYTES = 8
 
 
-@dataclass(frozen=True)
-class _Camera:
-    model: str
-    size: tuple[int, int]
-    params: Sequence[float]
+#: The name of a camera's model, its width and height in px, and its parameters.
+_Camera = tuple[str, tuple[int, int], Sequence[float]]
 
 
 @dataclass(frozen=True)
@@ -91,9 +88,8 @@ def read(root: Path) -> GivenPoses:
         image = images[name]
         if image.camera not in cameras:
             raise XrgsError(f"{images_file}: {name} has camera {image.camera}, which is missing")
-        own = cameras[image.camera]
         try:
-            return lens_of_model(own.model, own.size, own.params), _viewmat(image)
+            return lens_of_model(*cameras[image.camera]), _viewmat(image)
         except XrgsError as error:
             raise XrgsError(f"{images_file}: {name}: {error}") from error
 
@@ -310,13 +306,14 @@ class _Binary:
 
 
 def _binary_cameras(file: Path) -> dict[int, _Camera]:
-    data, names, cameras = _Binary(file), list(MODELS), {}
+    data, names = _Binary(file), list(MODELS)
+    cameras: dict[int, _Camera] = {}
     for _ in range(data.count(24)):
         number, model, width, height = map(int, data.values("IiQQ"))
         if not 0 <= model < len(names):
             raise XrgsError(f"{file}: camera {number} has the model number {model}, not known here")
         params = data.values(f"{len(MODELS[names[model]])}d")
-        cameras[number] = _Camera(names[model], (width, height), params)
+        cameras[number] = names[model], (width, height), params
     data.end()
     return cameras
 
@@ -348,13 +345,13 @@ def _binary_points(file: Path) -> _Points:
 
 
 def _text_cameras(file: Path) -> dict[int, _Camera]:
-    cameras = {}
+    cameras: dict[int, _Camera] = {}
     for number, line in _lines(file):
         if line:
             with _line(file, number, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS"):
                 own, model, width, height, *params = line.split()
                 size = int(width), int(height)
-                cameras[int(own)] = _Camera(model, size, [float(value) for value in params])
+                cameras[int(own)] = model, size, [float(value) for value in params]
     return cameras
 
 

@@ -8,28 +8,26 @@ includes only the code of its own policy. The value `flag` has no policy: it sel
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+from collections.abc import Callable
+from typing import NamedTuple
 
-from xrgs.mixture.tags.distance import Distance
-from xrgs.mixture.tags.megapixels import Megapixels
-from xrgs.mixture.tags.sampling_rate import SamplingRate
-
-if TYPE_CHECKING:
-    from xrgs.mixture.sampling_rate import Measures
+from xrgs.mixture.sampling_rate import Measures
+from xrgs.mixture.tags.distance import distance
+from xrgs.mixture.tags.megapixels import megapixels
+from xrgs.mixture.tags.sampling_rate import sampling_rate
 
 
-class TagPolicy(Protocol):
-    """Scores views."""
+class TagPolicy(NamedTuple):
+    """A way to score views."""
 
-    needs_depth: bool
-    """Whether the policy needs cameras and points, and so is applied after SfM."""
-
-    def score(self, view: Measures) -> float:
-        """Return a number above 0, higher for HR. NaN (unknown) makes the view LR."""
+    score: Callable[[Measures], float]
+    """Function of a view: a number above 0, higher for HR; NaN (unknown) makes the view LR."""
+    needs_depth: bool = True
+    """Whether it needs cameras and points, and so is applied after SfM."""
 
 
 POLICIES: dict[str, TagPolicy] = {
-    "megapixels": Megapixels(),
-    "distance": Distance(),
-    "sampling_rate": SamplingRate(),
+    "megapixels": TagPolicy(megapixels, needs_depth=False),
+    "distance": TagPolicy(distance),
+    "sampling_rate": TagPolicy(sampling_rate),
 }

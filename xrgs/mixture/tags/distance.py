@@ -2,17 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from xrgs.mixture.sampling_rate import Measures
+from xrgs.mixture.sampling_rate import Measures
 
 
-class Distance:
-    """The policy `distance`."""
-
-    needs_depth = True
-
-    def score(self, view: Measures) -> float:
-        """Return 1 / depth."""
-        return 1 / view.depth
+def distance(view: Measures) -> float:
+    """Return 1 / depth."""
+    return 1 / view.depth

@@ -2,18 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from xrgs.mixture.sampling_rate import Measures
+from xrgs.mixture.sampling_rate import Measures
 
 
-class Megapixels:
-    """The policy `megapixels`."""
-
-    needs_depth = False
-
-    def score(self, view: Measures) -> float:
-        """Return the pixel count of the original photograph."""
-        width, height = view.size
-        return float(width * height)
+def megapixels(view: Measures) -> float:
+    """Return the pixel count of the original photograph."""
+    width, height = view.size
+    return float(width * height)

@@ -2,19 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from xrgs.mixture.sampling_rate import sampling_rate
-
-if TYPE_CHECKING:
-    from xrgs.mixture.sampling_rate import Measures
+from xrgs.mixture import sampling_rate as rates
+from xrgs.mixture.sampling_rate import Measures
 
 
-class SamplingRate:
-    """The policy `sampling_rate`."""
-
-    needs_depth = True
-
-    def score(self, view: Measures) -> float:
-        """Return the sampling rate of the undistorted HR view: focal length over depth."""
-        return sampling_rate(view.K, view.depth)
+def sampling_rate(view: Measures) -> float:
+    """Return the sampling rate of the undistorted HR view: focal length over depth."""
+    return rates.sampling_rate(view.K, view.depth)

@@ -6,10 +6,11 @@ import fcntl
 import http.client
 import os
 import re
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from time import monotonic, sleep
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, Any
 from urllib.error import HTTPError
 from urllib.parse import urlsplit
 from urllib.request import HTTPRedirectHandler, Request, build_opener
@@ -19,9 +20,6 @@ from xrgs.runtime.progress import ProgressBar, log_line
 from xrgs.safeio.atomic import write_text
 from xrgs.safeio.hashing import file_digest
 from xrgs.safeio.sanitize import for_line
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
 
 #: A download is given up after this many successive tries with fewer than _LEAST_BYTES each.
 _TRIES = 6

@@ -7,24 +7,19 @@ from __future__ import annotations
 
 import hashlib
 import shlex
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from xrgs.config import SceneConf
 from xrgs.errors import XrgsError
 from xrgs.photos import masks
 from xrgs.photos.scenes.folder import list_photographs
 from xrgs.photos.scenes.kinds import KINDS, MADE, code_of
 from xrgs.photos.scenes.rendered import verify
-from xrgs.photos.scenes.scene import Scene, files_digest, label
+from xrgs.photos.scenes.scene import Scene, SceneKind, files_digest, label
 from xrgs.safeio.paths import user_path
 from xrgs.safeio.refactorings import ABSENT
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from xrgs.config import SceneConf
-    from xrgs.photos.scenes.scene import SceneKind
 
 __all__ = [
     "KINDS",

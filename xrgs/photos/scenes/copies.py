@@ -8,20 +8,16 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
+from collections.abc import Iterable, Sequence, Set
 from itertools import combinations
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from xrgs.photos import images
 from xrgs.photos.scenes.scene import content, remembered
 from xrgs.runtime.text import listed
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence, Set
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
 #: The names of LLFF's folders of one set of photographs: `images`, and `images_N`, N times smaller.
 SIZES = re.compile(r"images(?:_(\d+))?")

@@ -13,29 +13,23 @@ import os
 import re
 import unicodedata
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from xrgs.config import SceneConf
 from xrgs.errors import UnreadableError, XrgsError
 from xrgs.photos import foreign, images
 from xrgs.photos.masks import WORDS
 from xrgs.photos.scenes.copies import SIZES, one_of_each_size, without_copies
-from xrgs.photos.scenes.made import is_mask, without_made
-from xrgs.photos.scenes.panoramas import without_panoramas
+from xrgs.photos.scenes.no_photographs import is_mask, without_made, without_panoramas
 from xrgs.photos.scenes.scene import ALL_BELOW, Scene, files_digest, label, remembered
 from xrgs.runtime.text import listed
 from xrgs.safeio.files import is_name
 from xrgs.safeio.paths import user_path
 from xrgs.safeio.sanitize import counted, for_line
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
-
-    from xrgs.config import SceneConf
 
 #: Suffixes of images that are not read: raw files, stereo pairs and pictures of two fisheye lenses
 #: in one file, thumbnails, and formats that no camera of today writes.
@@ -193,7 +187,7 @@ def _all_below(folder: Path, long_side: int, masks: Path | None) -> _Found:
     dropped, notes = _other_sizes(tree, long_side)
     root = folder.resolve()
     for what in sorted(passed.keys() - {_MASKS}):
-        own = [inside for inside in passed[what] if not _is_link_into(inside, root)]
+        own = [f for f in passed[what] if what != _LINKS or not f.resolve().is_relative_to(root)]
         notes += _left_out({inside: _count_anywhere(inside) for inside in own}, folder, what)
     return _Found(
         {inside: files for inside, files in tree.items() if inside not in dropped},
@@ -251,10 +245,6 @@ def _made_by_programs(folder: Path) -> str:
         return "made of photographs, by the folder's name"
     found = (what for what, names in _MADE.items() if all((folder / n).exists() for n in names))
     return next(found, "")
-
-
-def _is_link_into(inside: Path, root: Path) -> bool:
-    return inside.is_symlink() and inside.resolve().is_relative_to(root)
 
 
 def _count_anywhere(folder: Path) -> int:

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from xrgs.photos.scenes.folder import FolderScene
 from xrgs.photos.scenes.motorcycle import Motorcycle
 from xrgs.photos.scenes.procedural import ProceduralScene
+from xrgs.photos.scenes.scene import SceneKind
 from xrgs.photos.scenes.video import VideoScene
 from xrgs.safeio.code import CodeFolders, code_digest
 from xrgs.safeio.refactorings import canonical
-
-if TYPE_CHECKING:
-    from xrgs.photos.scenes.scene import SceneKind
 
 _FOLDER = "photos/scenes"
 

@@ -6,18 +6,13 @@ truth". The pair is rectified: both cameras have one orientation, and are 193.00
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
+from xrgs.config import SceneConf
 from xrgs.photos.scenes.scene import Scene, bundled_photograph, files_digest, label
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from xrgs.config import SceneConf
 
 #: The calibration published with the pair, px at 741 x 500 and mm.
 _FOCAL = 994.978

@@ -7,22 +7,17 @@ in `still_life`, which needs torch; nothing here does.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
+from xrgs.config import SceneConf
 from xrgs.photos.scenes import rendered
 from xrgs.photos.scenes.scene import Scene, bundled_photograph, check_views, label
 from xrgs.safeio.hashing import digest, file_digest
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from xrgs.config import SceneConf
 
 #: The width of the views, px, where `variant.long_side` is 0.
 FULL_SIDE = 1008
@@ -76,7 +71,7 @@ class ProceduralScene:
             from xrgs.photos.scenes import still_life  # imports torch
 
             size = camera_size(long_side)
-            still_life.render(folder, TEXTURES, intrinsics(*size), size, exact)
+            still_life.render_views(folder, TEXTURES, intrinsics(*size), size, exact)
 
         files = rendered.provide(home, list(exact), render)
         # The intrinsics are known too, but SfM estimates them, as for a real capture.

@@ -7,8 +7,9 @@ torch.
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from msgspec import Struct
 
@@ -19,11 +20,6 @@ from xrgs.safeio.atomic import write_json
 from xrgs.safeio.files import remove_path, sync_name, sync_tree
 from xrgs.safeio.records import read_struct
 from xrgs.safeio.sanitize import for_line
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-    from pathlib import Path
-
 
 _log = logging.getLogger(__name__)
 _MANIFEST = "scene.json"

@@ -4,25 +4,22 @@ from __future__ import annotations
 
 import hashlib
 import time
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
+from xrgs.config import SceneConf
 from xrgs.errors import UnreadableError, XrgsError
 from xrgs.runtime.progress import progress
 from xrgs.safeio.hashing import file_digest
 from xrgs.safeio.paths import user_path
 from xrgs.safeio.sanitize import for_line
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from xrgs.config import SceneConf
 
 _Read = TypeVar("_Read")
 

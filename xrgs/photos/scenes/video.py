@@ -5,16 +5,22 @@ Sharpness is the variance of the Laplacian of the brightness [pechpacheco2000], 
 at which the noise of the sensor counts little. Frames are taken as a player shows them: with
 square pixels, upright, deinterlaced and in sRGB. HDR is refused, as in photographs. Nothing here
 imports av before frames are read.
+
+The frames of an interlaced video are woven of two fields that were taken one after the other.
+Moving things in them have combed edges, which would count as sharpness. Frames that the video marks
+as interlaced are deinterlaced by FFmpeg's `bwdif`, as in a player. If it marks none, `idet`
+compares the lines of each frame with its neighbours, and marks those of two fields.
 """
 
 from __future__ import annotations
 
 import logging
+from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import partial
 from importlib.util import find_spec
-from itertools import pairwise
+from itertools import chain, groupby, islice, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,8 +29,7 @@ import numpy as np
 from xrgs.errors import UnreadableError, XrgsError
 from xrgs.photos import colour, images
 from xrgs.photos.scenes import rendered
-from xrgs.photos.scenes.deinterlace import deinterlaced
-from xrgs.photos.scenes.panoramas import is_of_all_directions
+from xrgs.photos.scenes.no_photographs import is_of_all_directions
 from xrgs.photos.scenes.scene import Scene, check_views, label
 from xrgs.runtime.progress import ProgressBar
 from xrgs.safeio.files import is_transient
@@ -33,14 +38,16 @@ from xrgs.safeio.paths import user_path
 from xrgs.safeio.sanitize import for_line
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from av.container import InputContainer
+    from av.filter.graph import Graph
     from av.video.frame import VideoFrame
     from av.video.stream import VideoStream
     from numpy.typing import NDArray
 
     from xrgs.config import SceneConf
+
 
 _log = logging.getLogger(__name__)
 
@@ -51,6 +58,12 @@ _CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg"
 #: H.273's number of an unnamed matrix. For it players take BT.709's from this many rows on, and
 #: BT.601's for smaller frames.
 _UNKNOWN_MATRIX, _HD_ROWS = 2, 720
+#: `idet` leaves its first frames undecided, so this many frames are fed to it twice.
+_WARM_UP = 12
+#: `idet` marks a frame if one field differs this many times more from the frame before it than the
+#: other field does. FFmpeg's own 1.04 marks frames of a camera that moves slowly; our choice.
+_LEAST_RATIO = 1.2
+_TIME_BASE = Fraction(1, 25)
 
 
 @dataclass(frozen=True)
@@ -106,16 +119,24 @@ def _notes(file: Path) -> tuple[str, ...]:
     import av
 
     try:
-        with (
-            file.open("rb") as stream,
-            av.open(stream, "r", options={"format_whitelist": _CONTAINERS}) as container,
-        ):
+        with _opened(file) as container:
             count = len(_streams(container))
     except (av.FFmpegError, OSError):
         return ()
     if count < 2:
         return ()
     return (f"the first of the {count} video streams of {file.name} is read, and no other",)
+
+
+@contextmanager
+def _opened(file: Path) -> Iterator[InputContainer]:
+    import av
+
+    with (
+        file.open("rb") as stream,
+        av.open(stream, "r", options={"format_whitelist": _CONTAINERS}) as container,
+    ):
+        yield container
 
 
 def _streams(container: InputContainer) -> list[VideoStream]:
@@ -188,10 +209,7 @@ def _frames(file: Path) -> Iterator[_Frame]:
 
     number = 0
     try:
-        with (
-            file.open("rb") as stream,
-            av.open(stream, "r", options={"format_whitelist": _CONTAINERS}) as container,
-        ):
+        with _opened(file) as container:
             if not (streams := _streams(container)):
                 raise images.ImageError(f"{file}: it has no video")
             video = streams[0]
@@ -240,3 +258,62 @@ def _shown(frame: _Frame) -> images.ImageArray:
     image, _ = colour.convert(pixels, None, frame.encoding)
     turned = np.rot90(images.resize(image, *frame.size), round(decoded.rotation / 90) % 4)
     return np.ascontiguousarray(turned)
+
+
+def deinterlaced(frames: Iterable[VideoFrame]) -> Iterator[VideoFrame]:
+    """Yield every frame of a video; those of two fields are deinterlaced.
+
+    RGB frames stay as they are; all others get new times.
+    """
+    for _, alike in groupby(frames, _layout):
+        yield from _filtered(alike)
+
+
+def _layout(frame: VideoFrame) -> tuple[int, int, str, int, int]:
+    """Return the properties of a frame for which a filter graph is made."""
+    colours = int(frame.colorspace), int(frame.color_range)
+    return frame.width, frame.height, frame.format.name, *colours
+
+
+def _graph(warm_up: Sequence[VideoFrame]) -> Graph:
+    """Build the filter graph: a source of frames, the filters and a sink."""
+    from av.filter import Graph
+
+    width, height, pixels, matrix, levels = _layout(warm_up[0])
+    graph = Graph()
+    source = graph.add(
+        "buffer",
+        video_size=f"{width}x{height}",
+        pix_fmt=pixels,
+        time_base=str(_TIME_BASE),
+        pixel_aspect="1/1",
+        colorspace=str(matrix),
+        range=str(levels),
+    )
+    is_marked = any(frame.interlaced_frame for frame in warm_up)
+    detectors = [] if is_marked else [graph.add("idet", intl_thres=str(_LEAST_RATIO))]
+    filters = (*detectors, graph.add("bwdif", mode="send_frame", deint="interlaced"))
+    graph.link_nodes(source, *filters, graph.add("buffersink")).configure()
+    return graph
+
+
+def _filtered(frames: Iterator[VideoFrame]) -> Iterator[VideoFrame]:
+    """Yield filtered frames; all have one layout."""
+    import av
+
+    warm_up = [*islice(frames, _WARM_UP)]
+    if warm_up[0].format.is_rgb:
+        yield from chain(warm_up, frames)
+        return
+    graph = _graph(warm_up)
+    for time, frame in enumerate(chain(warm_up, warm_up, frames, [None]), -len(warm_up)):
+        if frame is not None:
+            frame.pts, frame.time_base = time, _TIME_BASE
+        graph.vpush(frame)
+        while True:
+            try:
+                made = graph.vpull()
+            except (av.BlockingIOError, av.EOFError):
+                break
+            if made.pts is not None and made.pts >= 0:
+                yield made

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from xrgs.formats.similarity import transformed
+from xrgs.formats.saved import transformed
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import Gaussians
 from xrgs.splat.rendering import rasterize
