@@ -100,7 +100,7 @@ class RenderTask:
             from xrgs.splat.native import rasterizer as native
 
             culling = self.method.culling
-            self.render = native.render_culled(self.leaves, *view, degree, None, culling)
+            self.render = native.render(self.leaves, *view, degree, None, culling=culling)
 
     def backward(self) -> tuple[Tensor, ...]:
         """Return the gradients of the six parameters for the last render, and free the graph."""

@@ -17,7 +17,7 @@ from xrgs.config import ComponentsConf, FormationConf
 from xrgs.splat.gaussians import Gaussians
 from xrgs.splat.resample import resize
 from xrgs.training.components import Step
-from xrgs.training.components.formation import BOX, BlurWidths
+from xrgs.training.components.supersampled import BOX, BlurWidths
 from xrgs.training.dataset import LoadedView
 
 LOW = replace(make_view("LR", noise(12, 15, 1)), name="low")
@@ -132,7 +132,7 @@ def test_an_update_is_adams_on_the_loss_with_its_prior() -> None:
         loss = loss + 0.1 * (logs - math.log(BOX)).square().sum()
         torch.autograd.backward(loss)
         adam.step()
-        torch.testing.assert_close(blur.logs.values[0], logs.detach(), atol=1e-6, rtol=0)
+        torch.testing.assert_close(blur.values[0], logs.detach(), atol=1e-6, rtol=0)
     assert blur.of("low") == blur.of("other")
 
 
@@ -154,6 +154,6 @@ def test_each_view_may_have_widths_of_its_own_and_learns_from_gradients() -> Non
 )
 def test_the_widths_are_said_at_the_end(of: str, message: str) -> None:
     blur = widths(of)
-    blur.logs.values[0] = torch.tensor([0.4, 0.3]).log()
+    blur.values[0] = torch.tensor([0.4, 0.3]).log()
     (found,) = blur.findings()
     assert f"LR views: {message}" in found
