@@ -107,9 +107,7 @@ def test_train_matches_counts_where_its_config_says_so(
 ) -> None:
     matched: list[int] = []
     monkeypatch.setattr(
-        count_matching,
-        "train_count_matched",
-        lambda _, conf, *__: matched.append(conf.components.count_matched.gaussians),
+        count_matching.ThresholdSearch, "run", lambda search, _: matched.append(search.target)
     )
     baseline.components.count_matched.gaussians = 70
     xrgs.train(data, baseline)

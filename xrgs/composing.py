@@ -6,7 +6,6 @@ reads its config from a file, does not need them.
 
 from __future__ import annotations
 
-import math
 import re
 import threading
 from contextlib import contextmanager
@@ -18,12 +17,11 @@ from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 
-from xrgs.config import CONF_DIR, PATHS, TRAINING_VIEWS, Conf, known_keys, types_of
+from xrgs.config import CONF_DIR, PATHS, Conf, known_keys, types_of
 from xrgs.errors import XrgsError, did_you_mean
 from xrgs.safeio.paths import user_path
 from xrgs.safeio.records import read_struct
-from xrgs.splat.backend import CHOICES
-from xrgs.splat.settings import NOMINAL_STEPS, SPLITS, STARTS, STRATEGIES
+from xrgs.splat.settings import NOMINAL_STEPS, outside_limits
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -32,7 +30,6 @@ if TYPE_CHECKING:
 
     from omegaconf import DictConfig
 
-    from xrgs.splat.settings import OptimizerSettings
 
 #: The start of an interpolation and the backslashes before it; an odd number escapes it.
 _INTERPOLATION = re.compile(r"(\\*)\$\{")
@@ -40,7 +37,6 @@ _INTERPOLATION = re.compile(r"(\\*)\$\{")
 _AT = re.compile(r" - at `\$\.?(.*)`$")
 #: Placeholder in `conf/config.yaml` for a value that the files of `conf/scene/` set.
 _OPEN = "???"
-_RETRY = ("none", "failed")
 _HYDRA_LOCK = threading.Lock()
 
 
@@ -111,9 +107,11 @@ def to_conf(cfg: DictConfig) -> Conf:
     _check_integers(values)
     conf = from_dict(values)
     _expand_home(conf)
-    _check_ranges(conf)
-    _check_optimizer(conf.splat.optimizer)
-    _check_choices(conf)
+    _check_limits(conf)
+    if (seed := conf.variant.sfm.seed) >= 2**31:
+        raise XrgsError(
+            f"variant.sfm.seed={seed}: must be below 2^31 = {2**31}, as COLMAP holds it"
+        )
     _check_strategy(conf)
     return conf
 
@@ -137,62 +135,16 @@ def _check_integers(values: dict[str, Any], path: str = "") -> None:
             raise XrgsError(f"{path}{name}={value}: must be below 2^63 = {2**63}")
 
 
-def _check_ranges(conf: Conf) -> None:
-    """Raise `XrgsError` for a number out of range; the message names its key."""
-    least_values = (
-        ("splat.optimizer.shN_every", conf.splat.optimizer.shN_every, 1),
-        ("seed", conf.seed, 0),
-        ("variant.seed", conf.variant.seed, 0),
-        ("variant.sfm.seed", conf.variant.sfm.seed, 0),
-        ("train.steps", conf.train.steps, 1),
-        ("train.evaluate_every", conf.train.evaluate_every, 0),
-        ("threads", conf.threads, 0),
-        ("checkpoint_s", conf.checkpoint_s, 0),
-        ("limits.minutes", conf.limits.minutes, 0),
-        ("limits.memory_gb", conf.limits.memory_gb, 0),
-    )
-    for key, value, least in least_values:
-        if not value >= least:
-            raise XrgsError(f"{key}={value}: must be at least {least}")
-    if (seed := conf.variant.sfm.seed) >= 2**31:
-        raise XrgsError(
-            f"variant.sfm.seed={seed}: must be below 2^31 = {2**31}, as COLMAP holds it"
-        )
-    for name in ("validation", "hr_share"):
-        if not 0 <= (share := getattr(conf.train, name)) < 1:
-            raise XrgsError(f"train.{name}={share}: must be from 0 to below 1")
-    if not (math.isfinite(scale := conf.splat.init_scale) and scale > 0):
-        raise XrgsError(f"splat.init_scale={scale}: must be finite and above 0")
-    for name in ("budget", "noise"):
-        value = getattr(conf.splat.densify, name)
-        if not (math.isfinite(value) and value >= 0):
-            raise XrgsError(f"splat.densify.{name}={value}: must be a finite number, 0 or more")
+def _check_limits(group: Any, path: str = "") -> None:
+    """Raise `XrgsError` for a value outside its limits; the message names its key.
 
-
-def _check_optimizer(optimizer: OptimizerSettings) -> None:
-    """Raise `XrgsError` for settings of the learning rates out of range."""
-    for name in ("means_decay_from", "length_decay_from"):
-        if not 0 <= (begin := getattr(optimizer, name)) < NOMINAL_STEPS:
-            raise XrgsError(
-                f"splat.optimizer.{name}={begin}: must be 0 or more and below {NOMINAL_STEPS}, the"
-                " length of a run"
-            )
-    if not 0 <= (power := optimizer.length_power) <= 1:
-        raise XrgsError(f"splat.optimizer.length_power={power}: must be from 0 to 1")
-
-
-def _check_choices(conf: Conf) -> None:
-    """Raise `XrgsError` for a value that is not among the choices of its key."""
-    for key, value, accepted in (
-        ("train.views", conf.train.views, TRAINING_VIEWS),
-        ("splat.backend", conf.splat.backend, CHOICES),
-        ("splat.strategy", conf.splat.strategy, STRATEGIES),
-        ("splat.init", conf.splat.init, STARTS),
-        ("splat.densify.split", conf.splat.densify.split, SPLITS),
-        ("retry", conf.retry, _RETRY),
-    ):
-        if value not in accepted:
-            raise XrgsError(f"{key}={value}: must be one of {', '.join(accepted)}")
+    Those of components are checked when a component that is on is built.
+    """
+    for message in outside_limits(group, path):
+        raise XrgsError(message)
+    for name, inner in vars(group).items():
+        if is_dataclass(inner) and name != "components":
+            _check_limits(inner, f"{path}{name}.")
 
 
 def _check_strategy(conf: Conf) -> None:

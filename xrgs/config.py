@@ -12,7 +12,15 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_type_hints
 
-from xrgs.splat.settings import DensifySettings, OptimizerSettings, RasterSettings
+from xrgs.splat.backend import CHOICES
+from xrgs.splat.settings import (
+    DECIDE,
+    STARTS,
+    STRATEGIES,
+    DensifySettings,
+    OptimizerSettings,
+    RasterSettings,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -32,9 +40,19 @@ GROUPS = (*PLUS_GROUPS, "scene", "preset", "variant")
 PATHS = ("scene.path", "scene.masks", "variant.poses", "store", "data_root")
 
 
-def off(value: Any) -> Any:
+def off(value: Any, **limits: Any) -> Any:
     """Declare a key, and its value that means "off". At this value it is in no cell's id."""
-    return field(metadata={"off": value})
+    return field(metadata={"off": value, **limits})
+
+
+def limited(**limits: Any) -> Any:
+    """Declare a key with limits, see `xrgs.splat.settings.outside_limits`; `off` takes them too."""
+    return field(metadata=limits)
+
+
+def amount(**limits: Any) -> Any:
+    """Declare a key that is finite and at least 0; with `off` it has a value that means "off"."""
+    return field(metadata={"finite": True, "least": 0, **limits})
 
 
 @dataclass(kw_only=True)
@@ -59,7 +77,7 @@ class SfmConf:
     max_num_features: int
     init_min_tri_angle: float
     min_registered: float
-    seed: int
+    seed: int = limited(least=0)
     camera: str
     first_octave: int | None
     min_inliers: int
@@ -88,7 +106,7 @@ class VariantConf:
     test_every: int
     test: list[str]
     poses: str | None
-    seed: int
+    seed: int = limited(least=0)
     tags: str
     hr_above: float
     degradation: str
@@ -104,71 +122,71 @@ class SplatConf:
     raster: RasterSettings
     optimizer: OptimizerSettings
     densify: DensifySettings
-    strategy: str = off("default")
-    init: str = off("sfm")
+    strategy: str = off("default", choices=STRATEGIES)
+    init: str = off("sfm", choices=STARTS)
     sh_every: int
     init_opacity: float
-    init_scale: float = off(1.0)
+    init_scale: float = off(1.0, finite=True, above=0)
     ssim_weight: float
-    backend: str
+    backend: str = limited(choices=CHOICES)
 
 
 @dataclass(kw_only=True)
 class TrainConf:
     """The length of a training, and its views."""
 
-    steps: int
-    views: str
-    evaluate_every: int = off(0)
-    validation: float = off(0.0)
-    hr_share: float = off(0.0)
+    steps: int = limited(least=1)
+    views: str = limited(choices=TRAINING_VIEWS)
+    evaluate_every: int = off(0, least=0)
+    validation: float = off(0.0, least=0, below=1)
+    hr_share: float = off(0.0, least=0, below=1)
 
 
 @dataclass(kw_only=True)
 class LossWeightingConf:
     """Resolution-aware loss weighting (paper, section 5.2)."""
 
-    lr_weight: float = off(1.0)
+    lr_weight: float = amount(off=1.0)
     # With an `lr_weight` of 1, continuous weighting still reads this key.
-    stat_from: str = off("weighted")
+    stat_from: str = off("weighted", choices=("weighted", "unweighted"))
 
 
 @dataclass(kw_only=True)
 class GradientScalingConf:
     """Gradient scaling for Gaussian radii (paper, section 5.3)."""
 
-    lr_scale: float = off(1.0)
+    lr_scale: float = amount(off=1.0)
 
 
 @dataclass(kw_only=True)
 class DensifyConf:
     """Resolution-aware densification and pruning (paper, section 5.4)."""
 
-    decide: str = off("shared")
-    lr_grow: float
-    lr_prune: float
+    decide: str = off("shared", choices=("shared", *DECIDE))
+    lr_grow: float = amount()
+    lr_prune: float = amount()
 
 
 @dataclass(kw_only=True)
 class CurriculumConf:
     """LR-only warm-up (paper, section 5.5)."""
 
-    lr_only: float = off(0.0)
+    lr_only: float = amount(off=0.0)
 
 
 @dataclass(kw_only=True)
 class RenderScaleConf:
     """Resolution-aware rendering (paper, sections 5.7 and 6.3)."""
 
-    gamma: float = off(0.0)
+    gamma: float = amount(off=0.0)
 
 
 @dataclass(kw_only=True)
 class SupersampledConf:
     """Coarse views rendered larger, then downsampled as their photographs; not in the paper."""
 
-    factor: int = off(1)
-    late_factor: int = off(1)
+    factor: int = off(1, least=1)
+    late_factor: int = off(1, least=1)
     late_from: int
 
 
@@ -176,105 +194,105 @@ class SupersampledConf:
 class FormationConf:
     """Trained widths of the blur of LR photographs; not in the paper."""
 
-    widths: str = off("none")
-    lr: float
-    prior: float
+    widths: str = off("none", choices=("none", "tag", "view"))
+    lr: float = amount()
+    prior: float = amount()
 
 
 @dataclass(kw_only=True)
 class ResolutionScheduleConf:
     """HR views at a reduced resolution early in training (DashGaussian); not in the paper."""
 
-    start_share: float = off(1.0)
-    until: int
+    start_share: float = off(1.0, above=0, most=1)
+    until: int = limited(least=1)
 
 
 @dataclass(kw_only=True)
 class ConsistencyConf:
     """Cross-resolution consistency loss (paper, section 5.6)."""
 
-    weight: float = off(0.0)
-    l1: float
-    ssim: float
-    lr_mode: str
+    weight: float = amount(off=0.0)
+    l1: float = amount()
+    ssim: float = amount()
+    lr_mode: str = limited(choices=("exact", "fold", "off"))
 
 
 @dataclass(kw_only=True)
 class AdaptiveWeightingConf:
     """Higher weight of LR views in scenes with little texture (paper, section 7.2, 1)."""
 
-    texture: float = off(0.0)
+    texture: float = amount(off=0.0)
 
 
 @dataclass(kw_only=True)
 class RegionWeightingConf:
     """Full weight of regions of LR views that are smooth or in no HR view (paper, 7.2, 2)."""
 
-    texture: float = off(0.0)
+    texture: float = amount(off=0.0)
 
 
 @dataclass(kw_only=True)
 class HybridScheduleConf:
     """Return of LR views to full weight after densification (paper, section 7.2, 3)."""
 
-    ramp: int = off(0)
+    ramp: int = amount(off=0)
 
 
 @dataclass(kw_only=True)
 class ContinuousWeightingConf:
     """Loss weights by the views' sampling rates instead of their tags (paper, conclusion)."""
 
-    gamma: float = off(0.0)
+    gamma: float = amount(off=0.0)
 
 
 @dataclass(kw_only=True)
 class MipConf:
     """Mip-Splatting's 3D smoothing filter; not in the paper."""
 
-    variance: float = off(0.0)
-    every: int
+    variance: float = amount(off=0.0)
+    every: int = limited(least=1)
 
 
 @dataclass(kw_only=True)
 class NaturalSelectionConf:
     """Removal of Gaussians that fade under a constant opacity gradient (GNS); not in the paper."""
 
-    budget: float = off(0.0)
+    budget: float = amount(off=0.0)
     until: int
-    drop_every: int = off(50)
+    drop_every: int = off(50, least=1)
 
 
 @dataclass(kw_only=True)
 class ExposureConf:
     """A trained colour map for each photograph; not in the paper."""
 
-    mode: str = off("none")
-    lr: float
-    lr_final: float
-    prior: float
+    mode: str = off("none", choices=("none", "affine", "gain"))
+    lr: float = amount()
+    lr_final: float = limited(above=0, most=1)
+    prior: float = amount()
 
 
 @dataclass(kw_only=True)
 class FloatersConf:
     """Removal of Gaussians in the empty space close to cameras; not in the paper."""
 
-    near_share: float = off(0.0)
+    near_share: float = amount(off=0.0)
 
 
 @dataclass(kw_only=True)
 class RegularizationConf:
     """Penalties on opacities and scales (3DGS-MCMC); not in the paper."""
 
-    opacity: float = off(0.0)
-    scale: float = off(0.0)
+    opacity: float = amount(off=0.0)
+    scale: float = amount(off=0.0)
 
 
 @dataclass(kw_only=True)
 class CountMatchedConf:
     """Training with the number of Gaussians of another cell (`xrgs.training.count_matching`)."""
 
-    gaussians: int = off(0)
-    tolerance: float
+    gaussians: int = amount(off=0)
+    tolerance: float = amount()
 
 
 @dataclass(kw_only=True)
@@ -308,8 +326,8 @@ class ComponentsConf:
 class LimitsConf:
     """Limits of time and memory; a cell that exceeds them is ended and counts as failed."""
 
-    minutes: float
-    memory_gb: float
+    minutes: float = limited(least=0)
+    memory_gb: float = limited(least=0)
 
 
 @dataclass(kw_only=True)
@@ -329,14 +347,14 @@ class Conf:
     train: TrainConf
     components: ComponentsConf
     matched_to: str | None
-    seed: int
+    seed: int = limited(least=0)
     store: str
     data_root: str
-    threads: int
-    checkpoint_s: float
+    threads: int = limited(least=0)
+    checkpoint_s: float = limited(least=0)
     limits: LimitsConf
     lpips: LpipsConf
-    retry: str
+    retry: str = limited(choices=("none", "failed"))
     baseline: bool
     fail_fast: bool
     dry_run: bool

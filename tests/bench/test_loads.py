@@ -17,7 +17,7 @@ from xrgs.splat.torch.projection import project
 
 
 def render(load: Load) -> torch.Tensor:
-    return rasterize_parameters(*load.parameters, load.camera, RasterSettings(), sh_degree=3).image
+    return rasterize_parameters(*load.gaussians, load.camera, RasterSettings(), sh_degree=3).image
 
 
 def rewritten(file: Path, **changes: object) -> Path:
@@ -30,8 +30,8 @@ def rewritten(file: Path, **changes: object) -> Path:
 
 def test_a_file_gives_back_what_was_written(load: Load, file: Path) -> None:
     again = loads.read(file)
-    for name in ("means", "quats", "scales", "opacities", "sh"):
-        assert torch.equal(getattr(again, name), getattr(load, name))
+    for value, written in zip(again.gaussians, load.gaussians, strict=True):
+        assert torch.equal(value, written)
     assert torch.equal(again.camera.viewmat, load.camera.viewmat)
     assert torch.equal(again.camera.K, load.camera.K)
     assert (again.camera.width, again.camera.height) == (40, 30)
@@ -39,10 +39,10 @@ def test_a_file_gives_back_what_was_written(load: Load, file: Path) -> None:
 
 
 def test_doubles_and_whole_numbers_are_read_too(load: Load, file: Path) -> None:
-    rewritten(file, means=load.means.double().numpy(), viewmat=np.eye(4, dtype=np.int64))
+    rewritten(file, means=load.gaussians.means.double().numpy(), viewmat=np.eye(4, dtype=np.int64))
     again = loads.read(file)
-    assert again.means.dtype == again.camera.viewmat.dtype == torch.float32
-    assert torch.equal(again.means, load.means)
+    assert again.gaussians.means.dtype == again.camera.viewmat.dtype == torch.float32
+    assert torch.equal(again.gaussians.means, load.gaussians.means)
 
 
 @pytest.mark.parametrize(
@@ -79,7 +79,7 @@ def test_what_is_no_npz_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("count", [300, 3000])
 def test_random_loads_put_as_many_gaussians_on_a_pixel_as_trained_ones(count: int) -> None:
     load = loads.random_load(count, 80, 60, seed=0)
-    done = rasterize_parameters(*load.parameters, load.camera, RasterSettings(), sh_degree=3)
+    done = rasterize_parameters(*load.gaussians, load.camera, RasterSettings(), sh_degree=3)
     assert 20 <= done.evaluations / (80 * 60) <= 150
     assert done.alpha.mean() > 0.9
 
@@ -104,16 +104,17 @@ def test_a_smaller_view_shows_the_same(load: Load) -> None:
 def test_the_seed_decides_a_random_load_and_larger_gaussians_overlap_more() -> None:
     usual, other = (loads.random_load(50, 40, 30, seed) for seed in (0, 1))
     larger = loads.random_load(50, 40, 30, 0, size_per_spacing=3.0)
-    np.testing.assert_allclose(larger.scales, 2 * usual.scales, rtol=1e-6)
-    np.testing.assert_array_equal(larger.means, usual.means)
-    assert not torch.equal(usual.means, other.means)
+    of_usual, of_other, of_larger = (each.gaussians for each in (usual, other, larger))
+    np.testing.assert_allclose(of_larger.scales, 2 * of_usual.scales, rtol=1e-6)
+    np.testing.assert_array_equal(of_larger.means, of_usual.means)
+    assert not torch.equal(of_usual.means, of_other.means)
 
 
 @pytest.mark.slow
 def test_the_scene_is_as_heavy_as_a_trained_one() -> None:
     """56 Gaussians contribute to a pixel, counted with Eq. 8 and 14 in the middle rows."""
     scene = loads.random_load(*run.FULL.scene, 0, run.SCENE_SIZE_PER_SPACING)
-    means, quats, scales, opacities, *_ = (value.double() for value in scene.parameters)
+    means, quats, scales, opacities, *_ = (value.double() for value in scene.gaussians)
     settings = RasterSettings()
     projected = project(means, quats, scales, opacities, scene.camera, settings)
     xx, xy, yy = projected.cov.unbind(-1)

@@ -1,8 +1,8 @@
-"""The errors and the shortcuts of rendering that the benchmark measures."""
+"""The errors, the shortcuts and the growth of rendering that the benchmark measures."""
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import fields
 from typing import Any
 
 import pytest
@@ -10,8 +10,8 @@ import torch
 
 from xrgs.bench import rendering
 from xrgs.bench.loads import Load, random_load
-from xrgs.bench.rendering import RenderMethod, RenderTask
-from xrgs.bench.timing import time_interleaved, use_threads
+from xrgs.bench.rendering import ALL_LOADS, RenderMethod, RenderTask, fit_growth
+from xrgs.bench.timing import time_interleaved
 from xrgs.splat.backend import resolve_backend
 from xrgs.splat.settings import CullingOptions, RasterSettings
 
@@ -20,13 +20,14 @@ BACKEND = resolve_backend("auto")
 
 def test_tasks_run_in_turn_and_the_number_of_threads_is_restored() -> None:
     ran: list[str] = []
-    tasks = {"a": lambda: ran.append("a"), "b": lambda: ran.append("b")}
-    times = time_interleaved(tasks, repeats=3)
-    assert "".join(ran) == "ab" + "ababab"  # once to warm up
-    assert [len(times[name]) for name in "ab"] == [3, 3]
     before = torch.get_num_threads()
-    with use_threads(before + 1):
-        assert torch.get_num_threads() == before + 1
+    tasks = {
+        name: (threads, lambda name=name: ran.append(f"{name}{torch.get_num_threads()}"))
+        for name, threads in (("a", before), ("b", before + 1))
+    }
+    times = time_interleaved(tasks, repeats=3)
+    assert ran == 4 * [f"a{before}", f"b{before + 1}"]  # once to warm up
+    assert [len(times[name]) for name in "ab"] == [3, 3]
     assert torch.get_num_threads() == before
 
 
@@ -49,8 +50,8 @@ def test_loads_too_large_for_torch_are_left_out() -> None:
 
 
 def test_a_rendering_gives_six_gradients(load: Load) -> None:
-    _, *gradients = RenderTask(load, RenderMethod("torch", "torch"), 1).results()
-    assert [g.shape for g in gradients] == [p.shape for p in load.parameters]
+    _, *gradients = RenderTask(load, RenderMethod("torch", "torch")).results()
+    assert [g.shape for g in gradients] == [p.shape for p in load.gaussians]
     assert all(g.abs().max() > 0 for g in gradients)
 
 
@@ -58,11 +59,9 @@ def test_a_rendering_gives_six_gradients(load: Load) -> None:
 def shortcuts() -> dict[str, dict[str, Any]]:
     """Shortcuts on a load with a third out of view and a third below `alpha_min`."""
     load = random_load(300, 120, 90, seed=0)
-    means, opacities = load.means.clone(), load.opacities.clone()
-    means[:100, 0] += 50
-    opacities[100:200] = 1e-4
-    wide = replace(load, means=means, opacities=opacities)
-    rows = rendering.time_shortcuts(wide, BACKEND, repeats=1)
+    load.gaussians.means[:100, 0] += 50
+    load.gaussians.opacities[100:200] = 1e-4
+    rows = rendering.time_shortcuts(load, BACKEND, repeats=1)
     return {row["shortcut"]: row for row in rows}
 
 
@@ -78,3 +77,46 @@ def test_each_shortcut_is_timed_and_keeps_the_error(shortcuts: dict[str, Any]) -
     assert shortcuts[rendering.INACTIVE_BANDS]["same_bits"] is True
     if blocks := shortcuts.get("blocks"):
         assert blocks["on_evaluations"] < 0.8 * blocks["off_evaluations"]
+
+
+GAUSSIANS, SIDES = (10, 100, 1000), (10, 20)
+
+
+def made_up_rows() -> list[dict[str, Any]]:
+    """Times on one thread that grow with Gaussians^0.8 and pixels^0.5, and others on two."""
+    return [
+        {
+            "method": "native",
+            "threads": threads,
+            "gaussians": count,
+            "width": side,
+            "height": side,
+            "forward_ms": 1e-3 * count**0.8 * side / threads**2,
+            "backward_ms": 2e-3 * count ** (0.8 if threads == 1 else 0.1) * side,
+        }
+        for threads in (1, 2)
+        for count in reversed(GAUSSIANS)
+        for side in SIDES
+    ]
+
+
+def test_each_size_has_an_exponent() -> None:
+    found = {(row["grows"], row["at"]): row for row in fit_growth(made_up_rows())}
+    counts = [f"{count:,} Gaussians" for count in GAUSSIANS]
+    keys = [("Gaussians", "10x10"), ("Gaussians", "20x20"), *(("pixels", at) for at in counts)]
+    assert list(found) == [*keys, ("Gaussians", ALL_LOADS), ("pixels", ALL_LOADS)]
+    for (grows, _), row in found.items():
+        assert row["exponent"] == pytest.approx(0.8 if grows == "Gaussians" else 0.5)
+    larger = found["Gaussians", "20x20"]
+    assert larger["sizes"] == list(GAUSSIANS)
+    assert larger["ms"] == pytest.approx([3e-3 * count**0.8 * 20 for count in GAUSSIANS])
+    assert found["pixels", "10 Gaussians"]["sizes"] == [100, 400]
+
+
+def test_a_fit_is_the_least_squares_of_the_logarithms() -> None:
+    rows = [row for row in made_up_rows() if row["width"] == 10]
+    for row in rows:
+        row["forward_ms"], row["backward_ms"] = {10: 1, 100: 50, 1000: 10}[row["gaussians"]], 0
+    assert fit_growth(rows[:1]) == [], "of a single load"
+    # The middle one of three equidistant points does not change the slope.
+    assert [row["exponent"] for row in fit_growth(rows)] == [pytest.approx(0.5)]

@@ -12,7 +12,7 @@ BACKEND = resolve_backend("auto")
 
 
 def test_a_step_trains_and_keeps_its_gaussians(load: Load) -> None:
-    step = training.TrainingStep(load, "torch", 1)
+    step = training.TrainingStep(load, "torch")
     losses = []
     for _ in range(2):
         before = step.gaussians.means.detach().clone()

@@ -15,7 +15,7 @@ from PIL import Image
 from xrgs.config import Conf, SplatConf
 from xrgs.evaluation import protocol
 from xrgs.splat.cameras import Camera
-from xrgs.splat.gaussians import Gaussians, from_points
+from xrgs.splat.gaussians import Gaussians
 from xrgs.splat.rendering import rasterize_parameters
 from xrgs.training.dataset import Dataset, LoadedView
 
@@ -24,7 +24,9 @@ from xrgs.training.dataset import Dataset, LoadedView
 def gaussians(data: Dataset) -> Gaussians:
     """Gaussians whose colours depend on the view direction, by random SH of every degree."""
     generator = torch.Generator().manual_seed(0)
-    made = from_points(data.points, data.colors, init_opacity=0.6, sh_degree=3, generator=generator)
+    made = Gaussians.from_points(
+        data.points, data.colors, init_opacity=0.6, sh_degree=3, generator=generator
+    )
     with torch.no_grad():
         made.shN += 0.3 * torch.randn(made.shN.shape, generator=generator)
     return made

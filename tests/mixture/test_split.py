@@ -19,7 +19,7 @@ from xrgs.mixture.split import (
     shrink_factor,
     split_views,
 )
-from xrgs.splat.ssim import WINDOW
+from xrgs.splat.loss import WINDOW
 
 Make = Callable[..., VariantConf]
 

@@ -12,8 +12,8 @@ from xrgs.splat.gaussians import PARAMETERS, ActivatedGaussians, Gaussians
 from xrgs.splat.optimizer import SplatOptimizer
 from xrgs.splat.rendering import Render, rasterize_parameters
 from xrgs.splat.settings import DensifySettings, OptimizerSettings, RasterSettings
+from xrgs.splat.strategy.base import Groups
 from xrgs.splat.strategy.default import DefaultStrategy
-from xrgs.splat.strategy.refinement import Groups
 
 Scene = dict[str, Tensor]
 """Activated parameters by name."""

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from tests.splat.scenes import Scene, draw, make_camera, make_scene, with_gradients
-from xrgs.splat.attribution import attribute_pixels
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import ActivatedGaussians
+from xrgs.splat.rendering import attribute_pixels
 from xrgs.splat.settings import RasterSettings
 
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from xrgs.splat.gaussians import MIN_SPACING, PARAMETERS, Gaussians, from_points
+from xrgs.splat.gaussians import MIN_SPACING, PARAMETERS, Gaussians
 from xrgs.splat.sh import sh_to_colors
 
 Array = NDArray[np.float64]
@@ -31,7 +31,7 @@ def start(
     sh_degree: int = 3,
     seed: int = 0,
 ) -> Gaussians:
-    return from_points(
+    return Gaussians.from_points(
         points,
         colors,
         init_opacity=init_opacity,

@@ -15,7 +15,7 @@ from xrgs.store.archive import import_store, pack
 from xrgs.store.store import Store
 from xrgs.store.texture import FILE, texture, texture_of, textures
 from xrgs.store.trimming import trim_variant
-from xrgs.training.components.texture import gradient_magnitude
+from xrgs.training.components.weighting import gradient_magnitude
 
 
 def test_texture_is_the_mean_of_the_gradient_that_components_use() -> None:

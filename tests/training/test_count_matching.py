@@ -14,7 +14,7 @@ from tests.conftest import composed as compose
 from tests.training.conftest import same
 from xrgs.config import Conf
 from xrgs.errors import XrgsError
-from xrgs.splat.gaussians import Gaussians, from_points
+from xrgs.splat.gaussians import Gaussians
 from xrgs.training import count_matching, loop
 from xrgs.training.components import Step
 from xrgs.training.count_matching import (
@@ -117,7 +117,7 @@ def model_of(count: int) -> Gaussians:
     """A model of so many Gaussians."""
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(count, 3, generator=generator)
-    return from_points(points, points, init_opacity=0.1, sh_degree=0, generator=generator)
+    return Gaussians.from_points(points, points, init_opacity=0.1, sh_degree=0, generator=generator)
 
 
 @pytest.mark.parametrize(("count", "mismatch"), [(150, False), (151, True), (49, True)])

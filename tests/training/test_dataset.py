@@ -8,6 +8,7 @@ import pytest
 import torch
 from PIL import Image
 
+from xrgs.config import TRAINING_VIEWS
 from xrgs.errors import XrgsError
 from xrgs.mixture.views import Variant, View
 from xrgs.photos import images
@@ -166,7 +167,7 @@ def test_a_share_of_the_hr_training_views_is_scored_and_not_trained_on(
 def test_every_control_of_a_seed_holds_out_the_same_views(many: Variant) -> None:
     mixed = dataset.load(many, validation=0.25, seed=3)
     left = set(names(mixed.train))
-    for use in dataset.USES:
+    for use in TRAINING_VIEWS:
         data = dataset.load(many, use, validation=0.25, seed=3)
         assert names(data.test) == names(mixed.test)
         assert names(data.train) == [n for n in names(dataset.load(many, use).train) if n in left]

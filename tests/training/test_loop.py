@@ -17,9 +17,9 @@ from omegaconf import OmegaConf
 from tests.conftest import composed as compose
 from tests.conftest import ramps
 from tests.training.conftest import masked, same
-from xrgs.config import CONF_DIR, Conf
+from xrgs.config import CONF_DIR, TRAINING_VIEWS, Conf
 from xrgs.errors import XrgsError
-from xrgs.splat.gaussians import ActivatedGaussians, Gaussians, from_points
+from xrgs.splat.gaussians import ActivatedGaussians, Gaussians
 from xrgs.splat.loss import photometric_loss, prepare_target
 from xrgs.splat.optimizer import SplatOptimizer
 from xrgs.splat.rendering import rasterize_parameters
@@ -29,7 +29,7 @@ from xrgs.training import components, recorder
 from xrgs.training.checkpoint import Checkpoint
 from xrgs.training.components import Step, base
 from xrgs.training.count_matching import train_cell
-from xrgs.training.dataset import USES, Dataset
+from xrgs.training.dataset import Dataset
 from xrgs.training.loop import train
 from xrgs.training.recorder import TrainingResult
 from xrgs.training.sampler import EpochSampler
@@ -44,7 +44,7 @@ COVERED = {
 }
 #: Every other file of `conf/ablation` that changes how training goes, not what is trained on.
 ABLATIONS = sorted(
-    {path.stem for path in (CONF_DIR / "ablation").glob("*.yaml")} - COVERED - set(USES)
+    {path.stem for path in (CONF_DIR / "ablation").glob("*.yaml")} - COVERED - set(TRAINING_VIEWS)
 )
 #: The ablations that `plus` is made of.
 IN_PLUS = set(OmegaConf.load(CONF_DIR / "ablation" / "plus.yaml").defaults)
@@ -68,7 +68,7 @@ def test_the_same_seed_gives_the_same_bits_and_another_does_not(
 def plain_loop(data: Dataset, conf: Conf) -> Gaussians:
     """gsplat's training written out for a config without components, densified every fifth step."""
     steps, seed = conf.train.steps, conf.seed
-    gaussians = from_points(
+    gaussians = Gaussians.from_points(
         data.points,
         data.colors,
         init_opacity=0.1,

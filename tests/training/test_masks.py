@@ -22,17 +22,15 @@ from tests.training.conftest import comparable
 from xrgs.evaluation import protocol
 from xrgs.mixture.views import Variant, View
 from xrgs.photos import images
-from xrgs.splat.attribution import attribute_pixels
 from xrgs.splat.cameras import Camera
-from xrgs.splat.gaussians import from_points
+from xrgs.splat.gaussians import Gaussians
 from xrgs.splat.loss import photometric_loss, prepare_target
-from xrgs.splat.rendering import rasterize_parameters
+from xrgs.splat.rendering import attribute_pixels, rasterize_parameters
 from xrgs.splat.strategy.default import DefaultStrategy
 from xrgs.store.texture import texture
 from xrgs.training import dataset
 from xrgs.training.components.mip import sampling_rates
-from xrgs.training.components.texture import mean_gradient
-from xrgs.training.components.weighting import _box_mean, region_attenuations
+from xrgs.training.components.weighting import _box_mean, mean_gradient, region_attenuations
 from xrgs.training.dataset import Dataset, LoadedView
 from xrgs.training.loop import train
 from xrgs.training.rendering import inside_mask
@@ -177,7 +175,7 @@ def test_a_view_counts_for_the_gaussians_that_it_shows_inside_its_mask(
     points = 0.8 * (torch.rand(2000, 3, generator=torch.Generator().manual_seed(4)) - 0.5)
     points[:, 2] += 2
     only = replace(data, train=(view,), points=points, colors=points.abs().clamp(0, 1))
-    start = from_points(
+    start = Gaussians.from_points(
         only.points,
         only.colors,
         init_opacity=conf.splat.init_opacity,

@@ -10,9 +10,9 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from xrgs.splat.gaussians import Gaussians, from_points
+from xrgs.splat.gaussians import Gaussians
 from xrgs.splat.rendering import Render
-from xrgs.splat.strategy.refinement import Refinement
+from xrgs.splat.strategy.base import Refinement
 from xrgs.training import recorder
 from xrgs.training.components import Step
 from xrgs.training.dataset import Dataset
@@ -22,7 +22,9 @@ from xrgs.training.recorder import TrainingRecorder, TrainingResult
 @pytest.fixture
 def gaussians(data: Dataset) -> Gaussians:
     generator = torch.Generator().manual_seed(0)
-    return from_points(data.points, data.colors, init_opacity=0.1, sh_degree=0, generator=generator)
+    return Gaussians.from_points(
+        data.points, data.colors, init_opacity=0.1, sh_degree=0, generator=generator
+    )
 
 
 Record = Callable[..., None]
@@ -120,7 +122,9 @@ def test_only_training_time_counts_and_a_restored_recorder_adds_to_it(
 def test_a_step_is_counted_by_its_render_and_its_photograph(data: Dataset) -> None:
     generator = torch.Generator().manual_seed(0)
     points, colors = torch.rand(7, 3, generator=generator), torch.rand(7, 3, generator=generator)
-    gaussians = from_points(points, colors, init_opacity=0.1, sh_degree=2, generator=generator)
+    gaussians = Gaussians.from_points(
+        points, colors, init_opacity=0.1, sh_degree=2, generator=generator
+    )
     view = data.train[0]
     width, height = view.camera.width, view.camera.height
     visible = torch.tensor([True, False, True, True, False, True, True])

@@ -32,10 +32,9 @@ from xrgs.bench.training import TrainingStep
 def main() -> None:
     """Answer the requests of standard input until it ends."""
     setup = json.loads(sys.stdin.readline())
-    threads = torch.get_num_threads()
-    scene = RenderTask(loads.read(Path(setup["scene"])), RenderMethod("native", "native"), threads)
+    scene = RenderTask(loads.read(Path(setup["scene"])), RenderMethod("native", "native"))
     steps = {
-        name: TrainingStep(loads.read(Path(file)), "native", threads)
+        name: TrainingStep(loads.read(Path(file)), "native")
         for name, file in setup["views"].items()
     }
     tasks: dict[str, Callable[[], object]] = {"render": scene.results}
@@ -44,9 +43,6 @@ def main() -> None:
     for line in sys.stdin:
         request = json.loads(line)
         torch.set_num_threads(request["threads"])
-        scene.threads = request["threads"]
-        for step in steps.values():
-            step.threads = request["threads"]
         start = time.perf_counter()
         tasks[request["task"]]()
         _answer({"ms": 1e3 * (time.perf_counter() - start)})

@@ -15,6 +15,7 @@ from xrgs.errors import XrgsError
 from xrgs.safeio import npz
 from xrgs.safeio.atomic import atomic_writer
 from xrgs.splat.cameras import Camera
+from xrgs.splat.gaussians import ActivatedGaussians
 from xrgs.splat.loss import WINDOW
 
 if TYPE_CHECKING:
@@ -40,24 +41,14 @@ SHAPES: dict[str, tuple[int | str, ...]] = {**_TENSORS, "width": (), "height": (
 
 @dataclass(frozen=True)
 class Load:
-    """Gaussians with activated float32 parameters, and a view to render."""
+    """Gaussians of float32 with 16 harmonics each, and a view to render."""
 
     name: str
-    means: Tensor  # [N, 3] world units
-    quats: Tensor  # [N, 4] wxyz
-    scales: Tensor  # [N, 3] world units
-    opacities: Tensor  # [N] 0..1
-    sh: Tensor  # [N, 16, 3]
+    gaussians: ActivatedGaussians
     camera: Camera
 
     def __len__(self) -> int:
-        return len(self.means)
-
-    @property
-    def parameters(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """The six parameters in the order of `rasterize_parameters`."""
-        sh0, rest = self.sh[:, :1].contiguous(), self.sh[:, 1:].contiguous()
-        return self.means, self.quats, self.scales, self.opacities, sh0, rest
+        return len(self.gaussians.means)
 
     @property
     def sizes(self) -> dict[str, str | int]:
@@ -72,11 +63,9 @@ class Load:
             factor: Divisor of width and height, which are rounded down, but at least 11 px, the
                 side of the SSIM window.
         """
-        camera = self.camera
-        width, height = (max(WINDOW, side // factor) for side in (camera.width, camera.height))
-        scale = torch.tensor([width / camera.width, height / camera.height, 1.0])
-        K = camera.K * scale[:, None]
-        return replace(self, camera=replace(camera, K=K, width=width, height=height))
+        sides = (self.camera.width, self.camera.height)
+        camera = self.camera.resized(*(max(WINDOW, side // factor) for side in sides))
+        return replace(self, camera=camera)
 
     def center_crop(self, width: int, height: int) -> Load:
         """Crop the view around its centre, to at most the given size, px."""
@@ -116,15 +105,19 @@ def random_load(
     sh = 0.1 * torch.randn(count, 16, 3, generator=generator)
     sh[:, 0] = uniform(count, 3, low=-1.5, high=1.5)
     K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
-    return Load(
-        name="random",
-        means=means,
-        quats=torch.randn(count, 4, generator=generator),
-        scales=size_per_spacing * spacing[:, None] * spread,
-        opacities=torch.sigmoid(1.5 * torch.randn(count, generator=generator) - 1.5),
-        sh=sh,
-        camera=Camera(viewmat=torch.eye(4), K=K, width=width, height=height),
+    gaussians = ActivatedGaussians(
+        means,
+        torch.randn(count, 4, generator=generator),
+        size_per_spacing * spacing[:, None] * spread,
+        torch.sigmoid(1.5 * torch.randn(count, generator=generator) - 1.5),
+        *_by_band(sh),
     )
+    return Load("random", gaussians, Camera(torch.eye(4), K, width, height))
+
+
+def _by_band(sh: Tensor) -> tuple[Tensor, Tensor]:
+    """Return band 0 [N, 1, 3] and the others [N, 15, 3] of harmonics [N, 16, 3]."""
+    return sh[:, :1].contiguous(), sh[:, 1:].contiguous()
 
 
 def read(path: Path) -> Load:
@@ -159,7 +152,8 @@ def read(path: Path) -> Load:
         camera = Camera(tensors.pop("viewmat"), tensors.pop("K"), width, height)
     except ValueError as error:
         raise XrgsError(f"{path}: {error}") from error
-    return Load(name=path.stem, camera=camera, **tensors)
+    sh0, rest = _by_band(tensors.pop("sh"))
+    return Load(path.stem, ActivatedGaussians(**tensors, sh0=sh0, shN=rest), camera)
 
 
 def _check(key: str, value: NDArray[Any], shape: tuple[int | str, ...]) -> None:
@@ -181,8 +175,9 @@ def write(path: Path, load: Load) -> None:
     Raises:
         XrgsError: The file cannot be written.
     """
-    camera = load.camera
-    tensors = {key: getattr(camera if key in {"viewmat", "K"} else load, key) for key in _TENSORS}
+    camera, tensors = load.camera, load.gaussians._asdict()
+    tensors["sh"] = torch.cat([tensors.pop("sh0"), tensors.pop("shN")], dim=1)
+    tensors |= {"viewmat": camera.viewmat, "K": camera.K}
     arrays = {key: value.numpy() for key, value in tensors.items()}
     try:
         with atomic_writer(path) as file:
@@ -207,10 +202,8 @@ def load_from_cell(folder: Path, view_name: str) -> Load:
     views = {view.name: view for view in (*data.train, *data.test)}
     if view_name not in views:
         raise XrgsError(f"view={view_name}: must be one of {', '.join(sorted(views))}")
-    means, quats, scales, opacities, sh0, rest = (
-        value.detach() for value in cell.gaussians().activated()
-    )
-    sh = torch.zeros(len(means), 16, 3)
-    sh[:, : 1 + rest.shape[1]] = torch.cat([sh0, rest], dim=1)
+    gaussians = ActivatedGaussians(*(value.detach() for value in cell.gaussians().activated()))
+    rest = torch.zeros(len(gaussians.means), 15, 3)
+    rest[:, : gaussians.shN.shape[1]] = gaussians.shN
     camera = views[view_name].camera
-    return Load(f"{folder.name}:{view_name}", means, quats, scales, opacities, sh, camera)
+    return Load(f"{folder.name}:{view_name}", gaussians._replace(shN=rest), camera)

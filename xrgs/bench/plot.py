@@ -15,8 +15,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-from xrgs.bench.growth import ALL_LOADS
-from xrgs.bench.rendering import TORCH_FLOAT64, total_ms
+from xrgs.bench.rendering import ALL_LOADS, TORCH_FLOAT64, total_ms
 from xrgs.bench.timing import Row
 from xrgs.bench.training import STEP_PARTS
 from xrgs.photos.images import SOFTWARE

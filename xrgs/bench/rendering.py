@@ -1,4 +1,4 @@
-"""Measures rendering forward and backward: time, work, memory, error, and the effect of culling."""
+"""Measures rendering: time and its growth, work, memory, error, and the effect of culling."""
 
 from __future__ import annotations
 
@@ -7,11 +7,14 @@ from dataclasses import dataclass, field, fields, replace
 from statistics import median
 from typing import Any
 
+import numpy as np
+import pandas as pd
 import torch
+from scipy.stats import linregress
 from torch import Tensor
 
 from xrgs.bench.loads import Load
-from xrgs.bench.timing import Row, time_interleaved, use_threads
+from xrgs.bench.timing import Row, time_interleaved
 from xrgs.splat.gaussians import ActivatedGaussians
 from xrgs.splat.rendering import Render, rasterize_parameters
 from xrgs.splat.settings import CullingOptions, RasterSettings
@@ -34,6 +37,7 @@ STAGES = (
 #: Name of the reference method for all errors.
 TORCH_FLOAT64 = "torch float64"
 INACTIVE_BANDS = "inactive SH bands"
+ALL_LOADS = "all loads"
 
 
 @dataclass(frozen=True)
@@ -62,7 +66,7 @@ def default_methods(backends: Sequence[str]) -> list[RenderMethod]:
 
 
 class RenderTask:
-    """Renders one load with one method and number of threads, any number of times.
+    """Renders one load with one method, any number of times.
 
     Attributes:
         image: The last image, [H, W, 3], after a call of `backward`.
@@ -72,9 +76,9 @@ class RenderTask:
         stages: Stage -> its shortest time, ms; only on the native backend.
     """
 
-    def __init__(self, load: Load, method: RenderMethod, count: int) -> None:
-        self.camera, self.method, self.threads = load.camera, method, count
-        leaves = (value.to(method.dtype).clone().requires_grad_() for value in load.parameters)
+    def __init__(self, load: Load, method: RenderMethod) -> None:
+        self.camera, self.method = load.camera, method
+        leaves = (value.to(method.dtype).clone().requires_grad_() for value in load.gaussians)
         self.leaves = ActivatedGaussians(*leaves)
         generator = torch.Generator().manual_seed(0)
         shape = (load.camera.height, load.camera.width, 3)
@@ -88,24 +92,22 @@ class RenderTask:
     def forward(self) -> None:
         """Render the load, and keep the autograd graph for `backward`."""
         view, degree = (self.camera, self.method.settings), self.method.sh_degree
-        with use_threads(self.threads):
-            if self.method.culling is None:
-                self.render = rasterize_parameters(
-                    *self.leaves, *view, sh_degree=degree, backend=self.method.backend
-                )
-            else:
-                from xrgs.splat.native import rasterizer as native
+        if self.method.culling is None:
+            self.render = rasterize_parameters(
+                *self.leaves, *view, sh_degree=degree, backend=self.method.backend
+            )
+        else:
+            from xrgs.splat.native import rasterizer as native
 
-                culling = self.method.culling
-                self.render = native.render_culled(self.leaves, *view, degree, None, culling)
+            culling = self.method.culling
+            self.render = native.render(self.leaves, *view, degree, None, culling=culling)
 
     def backward(self) -> tuple[Tensor, ...]:
         """Return the gradients of the six parameters for the last render, and free the graph."""
         render, self.render = self.render, None
         assert render is not None, "forward() must be called first"  # noqa: S101
         graph: Any = render.image.grad_fn
-        with use_threads(self.threads):
-            gradients = torch.autograd.grad(render.image, self.leaves, self.image_grad)
+        gradients = torch.autograd.grad(render.image, self.leaves, self.image_grad)
         self.image = render.image.detach()
         self.work = {"visible": int(render.visible.sum()), "evaluations": render.evaluations}
         self.buffer_bytes = render.buffer_bytes
@@ -155,11 +157,11 @@ def time_methods(
         A row for each method and number of threads: sizes, shortest and median times (ms), speed-up
         over the first number of threads, work, and memory (MiB).
     """
-    tasks = {(m.name, count): RenderTask(load, m, count) for m in methods for count in counts}
-    passes: dict[tuple[str, int, str], Callable[[], object]] = {}
+    tasks = {(m.name, count): RenderTask(load, m) for m in methods for count in counts}
+    passes: dict[tuple[str, int, str], tuple[int, Callable[[], object]]] = {}
     for key, task in tasks.items():
-        passes[*key, "forward"] = task.forward
-        passes[*key, "backward"] = task.backward
+        passes[*key, "forward"] = key[1], task.forward
+        passes[*key, "backward"] = key[1], task.backward
     times = time_interleaved(passes, repeats)
     rows: list[Row] = []
     for key, task in tasks.items():
@@ -170,7 +172,7 @@ def time_methods(
             **load.sizes,
             "method": task.method.name,
             "backend": task.method.backend,
-            "threads": task.threads,
+            "threads": key[1],
             "forward_ms": min(forward),
             "backward_ms": min(backward),
             "forward_median_ms": median(forward),
@@ -202,12 +204,12 @@ def errors(load: Load, methods: Sequence[RenderMethod]) -> dict[str, dict[str, f
         and `gradient_error`, the norm of a gradient's error over the norm of the gradient: the
         largest of the six parameters.
     """
-    crop, threads = load.center_crop(*ERROR_CROP), torch.get_num_threads()
+    crop = load.center_crop(*ERROR_CROP)
     exact = RenderMethod("exact", "torch", sh_degree=methods[0].sh_degree, dtype=torch.float64)
-    exact_image, *exact_gradients = RenderTask(crop, exact, threads).results()
+    exact_image, *exact_gradients = RenderTask(crop, exact).results()
     method_errors = {}
     for method in methods:
-        image, *gradients = RenderTask(crop, method, threads).results()
+        image, *gradients = RenderTask(crop, method).results()
         difference = (image.double() - exact_image).abs()
         method_errors[method.name] = {
             "image_mean_error": difference.mean().item(),
@@ -248,10 +250,10 @@ def time_shortcuts(load: Load, backend: str, repeats: int) -> list[Row]:
         rows += _compare_shortcuts(load, all_on, one_off, repeats)
     # Early in training only band 0 is on. Without the shortcut, the other bands, all zeros, are
     # evaluated too.
-    sh = torch.cat([load.sh[:, :1], torch.zeros_like(load.sh[:, 1:])], dim=1)
+    flat = load.gaussians._replace(shN=torch.zeros_like(load.gaussians.shN))
     one_off = [replace(all_on, name=INACTIVE_BANDS)]
     all_on = replace(all_on, sh_degree=0)
-    return rows + _compare_shortcuts(replace(load, sh=sh), all_on, one_off, repeats)
+    return rows + _compare_shortcuts(replace(load, gaussians=flat), all_on, one_off, repeats)
 
 
 def _compare_shortcuts(
@@ -265,10 +267,10 @@ def _compare_shortcuts(
         for name, row in timed.items()
     }
     active = bases(all_on.sh_degree) - 1  # bases of shN whose gradients are compared
-    *expected, expected_harmonics = RenderTask(load, all_on, 1).results()
+    *expected, expected_harmonics = RenderTask(load, all_on).results()
     rows = []
     for method in one_off:
-        *gradients, harmonics = RenderTask(load, method, 1).results()
+        *gradients, harmonics = RenderTask(load, method).results()
         same = all(map(torch.equal, gradients, expected))
         same &= torch.equal(harmonics[:, :active], expected_harmonics[:, :active])
         on, off = sides[all_on.name], sides[method.name]
@@ -285,3 +287,38 @@ def _compare_shortcuts(
             }
         )
     return rows
+
+
+def fit_growth(rows: Sequence[Row]) -> list[Row]:
+    """Fit power laws to the times of the first method on one thread.
+
+    Returns:
+        A row for each growing quantity (`grows`: "Gaussians" or "pixels") and each size of the
+        other quantity (`at`), with `sizes` in ascending order, `ms` (forward plus backward), and
+        the `exponent` of the power law: 1 if doubling the size doubles the time. The last two rows
+        are for a fit to all loads. Quantities that do not vary have no rows.
+    """
+    frame = pd.DataFrame(rows)
+    frame = frame[(frame["method"] == rows[0]["method"]) & (frame["threads"] == 1)]
+    frame = pd.DataFrame(
+        {
+            "Gaussians": frame["gaussians"],
+            "pixels": frame["width"] * frame["height"],
+            "size": frame["width"].astype(str) + "x" + frame["height"].astype(str),
+            "count": frame["gaussians"].map("{:,} Gaussians".format),
+            "ms": frame["forward_ms"] + frame["backward_ms"],
+        }
+    )
+    fits: list[Row] = []
+    for grows, fixed, name in (("Gaussians", "pixels", "size"), ("pixels", "Gaussians", "count")):
+        for _, group in frame.sort_values(grows).groupby(fixed):
+            if len(group) > 1:
+                fit = linregress(np.log(group[grows]), np.log(group["ms"]))
+                row = {"grows": grows, "at": group[name].iloc[0], "sizes": group[grows].tolist()}
+                fits.append(row | {"ms": group["ms"].tolist(), "exponent": float(fit.slope)})
+    if len({row["grows"] for row in fits}) == 2:
+        columns = [np.ones(len(frame)), np.log(frame["Gaussians"]), np.log(frame["pixels"])]
+        _, *slopes = np.linalg.lstsq(np.stack(columns, axis=1), np.log(frame["ms"]), rcond=None)[0]
+        for grows, slope in zip(("Gaussians", "pixels"), slopes, strict=True):
+            fits.append({"grows": grows, "at": ALL_LOADS, "exponent": float(slope)})
+    return fits

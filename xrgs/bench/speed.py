@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from xrgs.bench.loads import random_load
 from xrgs.bench.training import TrainingStep
 from xrgs.mixture import variant
-from xrgs.runtime.machine import set_torch_threads
+from xrgs.runtime.machine import set_torch_threads, torch_threads
 from xrgs.splat.backend import resolve_backend
 from xrgs.training import dataset
 from xrgs.training.loop import train
@@ -60,11 +60,12 @@ def seconds_per_unit(threads: int, backend: str = "auto") -> float:
     Gaussians.
     """
     load = random_load(_GAUSSIANS, *_SIZE, seed=0)
-    step = TrainingStep(load, resolve_backend(backend), threads)
-    step.run_step()  # the first step allocates memory
+    step = TrainingStep(load, resolve_backend(backend))
     times: list[float] = []
-    while sum(times) < _SECONDS or len(times) < _LEAST_STEPS:
-        start = time.perf_counter()
-        step.run_step()
-        times.append(time.perf_counter() - start)
+    with torch_threads(threads):
+        step.run_step()  # the first step allocates memory
+        while sum(times) < _SECONDS or len(times) < _LEAST_STEPS:
+            start = time.perf_counter()
+            step.run_step()
+            times.append(time.perf_counter() - start)
     return median(times) / (_SIZE[0] * _SIZE[1] + _GAUSSIANS)

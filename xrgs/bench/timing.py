@@ -3,42 +3,33 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
-import torch
+from xrgs.runtime.machine import torch_threads
 
 Row = dict[str, Any]  # column -> value
 _Key = TypeVar("_Key")
 
 
 def time_interleaved(
-    tasks: Mapping[_Key, Callable[[], object]], repeats: int
+    tasks: Mapping[_Key, tuple[int, Callable[[], object]]], repeats: int
 ) -> dict[_Key, list[float]]:
     """Run each task once to warm up, then all tasks in turn (A B A B ...).
+
+    Args:
+        tasks: Key -> number of threads, and function.
+        repeats: Number of timed runs of each.
 
     Returns:
         Key -> duration of each run, ms.
     """
-    for task in tasks.values():
-        task()
     durations: dict[_Key, list[float]] = {key: [] for key in tasks}
     # In turn, so that other work on the machine slows down all tasks alike.
-    for _ in range(repeats):
-        for key, task in tasks.items():
-            start = time.perf_counter()
-            task()
-            durations[key].append(1e3 * (time.perf_counter() - start))
-    return durations
-
-
-@contextmanager
-def use_threads(count: int) -> Iterator[None]:
-    """Set the number of threads of torch and of the native kernels for a `with` block."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)  # the native kernels read torch's number
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
+    for _ in range(1 + repeats):
+        for key, (threads, task) in tasks.items():
+            with torch_threads(threads):
+                start = time.perf_counter()
+                task()
+                durations[key].append(1e3 * (time.perf_counter() - start))
+    return {key: times[1:] for key, times in durations.items()}

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from xrgs.bench.loads import Load, random_load
-from xrgs.bench.timing import Row, time_interleaved, use_threads
+from xrgs.bench.timing import Row, time_interleaved
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.splat.loss import photometric_loss, prepare_target
 from xrgs.splat.optimizer import SplatOptimizer
@@ -26,6 +26,9 @@ L1, SSIM = 0.8, 0.2  # weights of the photometric loss
 STEP_PARTS = ("render", "loss", "backward", "optimizer", "densify")
 _MEMORY_STEPS = 3  # in the first step the optimizer has no state yet
 _PROCESS_STATUS = Path("/proc/self/status")
+_SETTINGS = DensifySettings(
+    start=0, grow_grad2d=math.inf, prune_opacity=0.0, prune_scale3d=math.inf
+)
 
 
 class TrainingStep:
@@ -35,78 +38,62 @@ class TrainingStep:
     its thresholds are out of reach, so that the number of Gaussians does not change.
     """
 
-    def __init__(self, load: Load, backend: str, count: int, *, sh_degree: int = 3) -> None:
-        self.load, self.camera, self.backend, self.threads = load, load.camera, backend, count
+    def __init__(self, load: Load, backend: str, *, sh_degree: int = 3) -> None:
+        self.load, self.camera, self.backend = load, load.camera, backend
         self.sh_degree = sh_degree
-        means, quats, scales, opacities, sh0, rest = load.parameters
-        raw_scales = scales.clamp_min(1e-8).log()
-        raw_opacities = opacities.clamp(1e-4, 1 - 1e-4).logit()
-        raw = (means, quats, raw_scales, raw_opacities, sh0, rest)
+        raw = load.gaussians._replace(
+            scales=load.gaussians.scales.clamp_min(1e-8).log(),
+            opacities=load.gaussians.opacities.clamp(1e-4, 1 - 1e-4).logit(),
+        )
         self.gaussians = Gaussians(*(value.clone().requires_grad_() for value in raw))
         self.optimizer = SplatOptimizer(
             self.gaussians, OptimizerSettings(), scene_scale=1.0, steps=30_000, backend=backend
         )
-        self.settings = DensifySettings(
-            start=0, grow_grad2d=math.inf, prune_opacity=0.0, prune_scale3d=math.inf
-        )
         self.strategy = DefaultStrategy(
-            self.optimizer, self.settings, scene_scale=1.0, generator=torch.Generator()
+            self.optimizer, _SETTINGS, scene_scale=1.0, generator=torch.Generator()
         )
         self.render()
         self.target = prepare_target(self.rendered.image.detach() + 0.01, backend=backend)
 
     def render(self) -> None:
         """Render; the native backend also applies the activation functions."""
-        with use_threads(self.threads):
-            self.optimizer.zero_grad()
-            self.offset = zero_means2d_offset(len(self.gaussians))
-            self.rendered = rasterize_parameters(
-                *self.gaussians.raw(),
-                self.camera,
-                RasterSettings(),
-                sh_degree=self.sh_degree,
-                means2d_offset=self.offset,
-                raw=True,
-                backend=self.backend,
-            )
+        self.optimizer.zero_grad()
+        self.offset = zero_means2d_offset(len(self.gaussians))
+        self.rendered = rasterize_parameters(
+            *self.gaussians.raw(),
+            self.camera,
+            RasterSettings(),
+            sh_degree=self.sh_degree,
+            means2d_offset=self.offset,
+            raw=True,
+            backend=self.backend,
+        )
 
     def loss(self) -> None:
         """Compute the loss; the native backend also computes its gradient."""
-        with use_threads(self.threads):
-            self.value = photometric_loss(
-                self.rendered.image, self.target, l1=L1, ssim=SSIM, backend=self.backend
-            )
+        self.value = photometric_loss(
+            self.rendered.image, self.target, l1=L1, ssim=SSIM, backend=self.backend
+        )
 
     def backward(self) -> None:
         """Backpropagate to the raw parameters."""
-        with use_threads(self.threads):
-            torch.autograd.backward(self.value)
+        torch.autograd.backward(self.value)
 
     def optimize(self) -> None:
         """Take one step of Adam."""
-        with use_threads(self.threads):
-            self.optimizer.step(self.camera, sh_degree=self.sh_degree)
+        self.optimizer.step(self.camera, sh_degree=self.sh_degree)
 
-    def densify(self) -> None:
-        """Run densification as in a step without refinement."""
-        for step in range(1, self.settings.every + 1):
-            self._densify_after(step)
+    def densify(self, steps: int = _SETTINGS.every) -> None:
+        """Run densification as in steps without refinement."""
+        size = {"width": self.camera.width, "height": self.camera.height}
+        for step in range(1, steps + 1):
+            self.strategy.after_step(step, self.offset.grad, self.rendered.visible, **size)
 
     def run_step(self) -> None:
         """Run a whole step, without refinement."""
         for part in (self.render, self.loss, self.backward, self.optimize):
             part()
-        self._densify_after(1)
-
-    def _densify_after(self, step: int) -> None:
-        with use_threads(self.threads):
-            self.strategy.after_step(
-                step,
-                self.offset.grad,
-                self.rendered.visible,
-                width=self.camera.width,
-                height=self.camera.height,
-            )
+        self.densify(steps=1)
 
     def parts(self) -> list[Callable[[], None]]:
         """Return the functions of the parts, in the order of `STEP_PARTS`."""
@@ -130,12 +117,12 @@ def time_steps(
         (`step_ms`), and the `speedup` over one thread.
     """
     steps = {
-        (view, count): TrainingStep(load, backend, count)
+        (view, count): TrainingStep(load, backend)
         for view, load in views.items()
         for count in counts
     }
     tasks = {
-        (*key, part): run
+        (*key, part): (key[1], run)
         for key, step in steps.items()
         for part, run in zip(STEP_PARTS, step.parts(), strict=True)
     }
@@ -143,7 +130,7 @@ def time_steps(
     rows: list[Row] = []
     for (view, count), step in steps.items():
         ms = {part: min(times[view, count, part]) for part in STEP_PARTS}
-        ms["densify"] /= step.settings.every
+        ms["densify"] /= _SETTINGS.every
         row: Row = {"view": view, "backend": backend, "threads": count, **step.load.sizes}
         row |= {f"{part}_ms": value for part, value in ms.items()} | {"step_ms": sum(ms.values())}
         first_row = next((other for other in rows if other["view"] == view), row)
@@ -168,7 +155,8 @@ def time_shortcuts(load: Load, backend: str, repeats: int) -> list[Row]:
     }
     rows = []
     for (shortcut, part), pair in pairs.items():
-        times = time_interleaved(dict(zip(("on", "off"), pair, strict=True)), repeats)
+        sides = {side: (1, task) for side, task in zip(("on", "off"), pair, strict=True)}
+        times = time_interleaved(sides, repeats)
         on, off = min(times["on"]), min(times["off"])
         row = {"shortcut": shortcut, **load.sizes, "backend": backend, "threads": 1}
         rows.append(row | {"part": part, "on_ms": on, "off_ms": off, "times": off / on})
@@ -184,11 +172,10 @@ def loss_gradients(load: Load, backend: str) -> tuple[Callable[[], Tensor], ...]
     target = prepare_target(photograph, backend=backend)
 
     def gradient(*, prepared: bool) -> Tensor:
-        with use_threads(1):
-            used = target if prepared else prepare_target(photograph, backend=backend)
-            loss = photometric_loss(image, used, l1=L1, ssim=SSIM, backend=backend)
-            v_image: Tensor = torch.autograd.grad(loss, image)[0]
-            return v_image
+        used = target if prepared else prepare_target(photograph, backend=backend)
+        loss = photometric_loss(image, used, l1=L1, ssim=SSIM, backend=backend)
+        v_image: Tensor = torch.autograd.grad(loss, image)[0]
+        return v_image
 
     return partial(gradient, prepared=True), partial(gradient, prepared=False)
 
@@ -198,7 +185,7 @@ def steps_of_sh_degrees(load: Load, backend: str) -> tuple[TrainingStep, Trainin
 
     At degree 0 all moments of shN are zero, and Adam skips shN.
     """
-    before, after = (TrainingStep(load, backend, 1, sh_degree=degree) for degree in (0, 3))
+    before, after = (TrainingStep(load, backend, sh_degree=degree) for degree in (0, 3))
     for step in (before, after):
         step.loss()
         step.backward()
@@ -225,10 +212,11 @@ def measure_memory(backend: str, gaussians: int, width: int, height: int, thread
 def _memory_of_this_process(
     backend: str, gaussians: int, width: int, height: int, threads: int
 ) -> Row:
+    torch.set_num_threads(threads)
     # A tiny step first, so that memory of lazily loaded libraries is part of the base.
-    _train(TrainingStep(random_load(50, 16, 16, seed=0), backend, threads))
+    _train(TrainingStep(random_load(50, 16, 16, seed=0), backend))
     base, _ = _resident_mib()
-    step = TrainingStep(random_load(gaussians, width, height, seed=0), backend, threads)
+    step = TrainingStep(random_load(gaussians, width, height, seed=0), backend)
     row: Row = {"backend": backend, "threads": threads, **step.load.sizes}
     row["counted_mib"] = _train(step) / 2**20
     _, peak = _resident_mib()

@@ -7,7 +7,7 @@ import os
 import resource
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path, PurePosixPath
 
 import psutil
@@ -152,13 +152,18 @@ def gpus() -> list[str]:
 
 
 @contextmanager
-def single_torch_thread() -> Iterator[int]:
-    """Limit torch to one thread during a block; yield the number before and after it."""
+def torch_threads(count: int) -> Iterator[int]:
+    """Set the threads of torch and the kernels in a block; yield the number before and after it."""
     import torch
 
     threads = torch.get_num_threads()
-    torch.set_num_threads(1)
+    torch.set_num_threads(count)  # the kernels read torch's number
     try:
         yield threads
     finally:
         torch.set_num_threads(threads)
+
+
+def single_torch_thread() -> AbstractContextManager[int]:
+    """Limit torch to one thread during a block; yield the number before and after it."""
+    return torch_threads(1)

@@ -86,8 +86,8 @@ class _WriteErrorsIgnored(io.FileIO):
 def guard_streams() -> None:
     """Give this process three standard streams, of which stdout and stderr never fail.
 
-    A stream that was closed at the start, as a daemon starts its children, becomes /dev/null. Text to a
-    closed terminal, a pipe without a reader or a full disk is lost, and the work goes on.
+    A stream that was closed at the start, as a daemon starts its children, becomes /dev/null. Text
+    to a closed terminal, a pipe without a reader or a full disk is lost, and the work goes on.
 
     Every command calls this before it opens a file: a file gets the lowest free descriptor, and
     what libraries print to a closed stdout would be written into it.

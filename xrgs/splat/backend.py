@@ -27,7 +27,7 @@ DEVICES = {"native": "cpu", "torch": "cpu", "gsplat": "cuda"}
 _GSPLAT_ALPHA_MAX = {"1.5.3": 0.999, "1.6": 0.99}
 """Supported versions of gsplat -> the cap of alpha in the kernels of each."""
 
-Operation = Literal["activations", "densify", "loss", "optimizer", "rasterizer", "resample"]
+Operation = Literal["elementwise", "loss", "optimizer", "rasterizer", "resample"]
 """A module of `xrgs/splat/torch/` and `xrgs/splat/native/`; `xrgs/splat/gsplat/` has only the
 rasterizer."""
 

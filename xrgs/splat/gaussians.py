@@ -82,15 +82,22 @@ class Gaussians:
         colors: Tensor | NDArray[np.uint8],
         *,
         init_opacity: float = 0.1,
+        init_scale: float = 1.0,
         sh_degree: int = 3,
         generator: torch.Generator | None = None,
     ) -> Gaussians:
         """Place one Gaussian on each point of a point cloud.
 
+        As `create_splats_with_optimizers` of gsplat's trainer: each Gaussian is isotropic, its
+        quaternion is random, band 0 of the harmonics is the point's colour, and the other bands
+        are 0.
+
         Args:
             points: [P, 3] world units, at least 4 points.
             colors: [P, 3], 8-bit, or floats in 0..1.
             init_opacity: Opacity of each Gaussian, above 0 and below 1; 0.1 is gsplat's default.
+            init_scale: Scale of each Gaussian, above 0, as a multiple of the RMS distance to the
+                three nearest points.
             sh_degree: Highest stored band of the spherical harmonics, 0 to 3.
             generator: Draws the quaternions; None takes a generator with seed 0.
 
@@ -98,12 +105,30 @@ class Gaussians:
             P Gaussians, float32 leaf tensors that require gradients.
 
         Raises:
-            ValueError: As for the function `from_points`.
+            ValueError: There are fewer than 4 points, shapes do not fit, values are not finite, or
+                `init_opacity`, `init_scale` or `sh_degree` is out of range.
         """
+        check_degree(sh_degree)
+        means = torch.as_tensor(points, dtype=torch.float32)
+        rgb = torch.as_tensor(colors)
+        rgb = rgb.float() / 255.0 if rgb.dtype == torch.uint8 else rgb.float()
+        _check_points(means, rgb)
+        if not 0.0 < init_opacity < 1.0:
+            raise ValueError(f"init_opacity must be between 0 and 1, got {init_opacity}")
+        if not (math.isfinite(init_scale) and init_scale > 0.0):
+            raise ValueError(f"init_scale must be finite and above 0, got {init_scale}")
+        count = len(means)
         generator = generator or torch.Generator().manual_seed(0)
-        return from_points(
-            points, colors, init_opacity=init_opacity, sh_degree=sh_degree, generator=generator
-        )
+        log_scales = torch.from_numpy(np.log(_spacing(means) * init_scale)).float()  # [P]
+        tensors = {
+            "means": means.clone(),
+            "quats": torch.rand((count, 4), generator=generator),
+            "scales": log_scales[:, None].repeat(1, 3),
+            "opacities": torch.full((count,), math.log(init_opacity / (1 - init_opacity))),
+            "sh0": colors_to_sh0(rgb),
+            "shN": torch.zeros((count, bases(sh_degree) - 1, 3)),
+        }
+        return cls(**{name: value.requires_grad_() for name, value in tensors.items()})
 
     def to(self, device: str) -> Gaussians:
         """Return the Gaussians on a device: themselves if they are there, else new leaf tensors."""
@@ -133,59 +158,24 @@ class Gaussians:
         Raises:
             ValueError: The parameters are not float32 on the CPU for the native backend.
         """
-        activate = implementation("activations", backend).activate
-        scales, opacities = activate(self.scales, self.opacities)
-        return ActivatedGaussians(*self.raw())._replace(scales=scales, opacities=opacities)
+        functions = implementation("elementwise", backend)
+        return ActivatedGaussians(*self.raw())._replace(
+            scales=functions.exp(self.scales), opacities=functions.logistic(self.opacities)
+        )
 
 
-def from_points(
-    points: Tensor | NDArray[np.float64],
-    colors: Tensor | NDArray[np.uint8],
-    *,
-    init_opacity: float,
-    init_scale: float = 1.0,
-    sh_degree: int,
-    generator: torch.Generator,
-) -> Gaussians:
-    """Place a Gaussian on each SfM point, as `create_splats_with_optimizers` of gsplat's trainer.
-
-    Each Gaussian is isotropic. Its scale is `init_scale`, above 0, times the RMS distance to the
-    three nearest points. The quaternions are random. Band 0 of the harmonics is the point's colour,
-    the other bands are 0. The other arguments and the result are those of `Gaussians.from_points`.
-
-    Raises:
-        ValueError: There are fewer than 4 points, shapes do not fit, values are not finite, or
-            `init_opacity`, `init_scale` or `sh_degree` is out of range.
-    """
-    check_degree(sh_degree)
-    means = torch.as_tensor(points, dtype=torch.float32)
-    rgb = torch.as_tensor(colors)
-    rgb = rgb.float() / 255.0 if rgb.dtype == torch.uint8 else rgb.float()
-    count = means.shape[0]
+def _check_points(means: Tensor, rgb: Tensor) -> None:
     if means.ndim != 2 or means.shape[1] != 3 or rgb.shape != means.shape:
         raise ValueError(
             f"points and colors must both be [P, 3], got {list(means.shape)} and {list(rgb.shape)}"
         )
-    if count < 4:
-        raise ValueError(f"points: at least 4 are needed to measure their spacing, got {count}")
+    if len(means) < 4:
+        raise ValueError(
+            f"points: at least 4 are needed to measure their spacing, got {len(means)}"
+        )
     for name, values in (("points", means), ("colors", rgb)):
         if not torch.isfinite(values).all():
             raise ValueError(f"{name} has values that are not finite")
-    if not 0.0 < init_opacity < 1.0:
-        raise ValueError(f"init_opacity must be between 0 and 1, got {init_opacity}")
-    if not (math.isfinite(init_scale) and init_scale > 0.0):
-        raise ValueError(f"init_scale must be finite and above 0, got {init_scale}")
-
-    log_scales = torch.from_numpy(np.log(_spacing(means) * init_scale)).float()  # [P]
-    tensors = {
-        "means": means.clone(),
-        "quats": torch.rand((count, 4), generator=generator),
-        "scales": log_scales[:, None].repeat(1, 3),
-        "opacities": torch.full((count,), math.log(init_opacity / (1 - init_opacity))),
-        "sh0": colors_to_sh0(rgb),
-        "shN": torch.zeros((count, bases(sh_degree) - 1, 3)),
-    }
-    return Gaussians(**{name: value.requires_grad_() for name, value in tensors.items()})
 
 
 def _spacing(points: Tensor) -> NDArray[np.float64]:

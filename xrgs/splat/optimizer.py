@@ -12,7 +12,7 @@ from torch import Tensor
 from xrgs.splat.backend import implementation, resolve_backend
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
-from xrgs.splat.settings import NOMINAL_STEPS, OptimizerSettings
+from xrgs.splat.settings import NOMINAL_STEPS, OptimizerSettings, outside_limits
 
 _MOMENTS = ("exp_avg", "exp_avg_sq")
 LENGTH_GROUPS = ("scales", "quats", "sh0", "shN")
@@ -86,20 +86,8 @@ class SplatOptimizer:
             raise ValueError(f"scene_scale must be finite and above 0, got {scene_scale}")
         if steps < 1:
             raise ValueError(f"steps must be at least 1, got {steps}")
-        if not 0 <= settings.means_decay_from < NOMINAL_STEPS:
-            raise ValueError(
-                f"means_decay_from must be 0 or more and below {NOMINAL_STEPS}, got"
-                f" {settings.means_decay_from}"
-            )
-        if not 0 <= settings.length_decay_from < NOMINAL_STEPS:
-            raise ValueError(
-                f"length_decay_from must be 0 or more and below {NOMINAL_STEPS}, got"
-                f" {settings.length_decay_from}"
-            )
-        if not 0 <= settings.length_power <= 1:
-            raise ValueError(f"length_power must be 0 to 1, got {settings.length_power}")
-        if settings.shN_every < 1:
-            raise ValueError(f"shN_every must be at least 1, got {settings.shN_every}")
+        for message in outside_limits(settings):
+            raise ValueError(message)
         self.gaussians = gaussians
         self.settings = settings
         self.means_rate = settings.means * scene_scale

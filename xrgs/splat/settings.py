@@ -7,7 +7,10 @@ import torch, so that planning is quick. Step counts are for a run of 30,000 ste
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field, fields, replace
+from operator import ge, gt, le, lt
 from typing import Any
 
 NOMINAL_STEPS = 30_000
@@ -27,13 +30,43 @@ STARTS = ("sfm", "dense")
 """Where the first Gaussians are placed: on the SfM points, or also on surfaces from stereo
 matching (`xrgs.training.dense`)."""
 
+DECIDE = ("current_view", "per_class", "own_threshold")
+"""Which thresholds apply at a refinement, where views have groups (`Groups` of
+`xrgs.splat.strategy.base`)."""
+
 SPLITS = ("random", "long_axis")
 """The values of `DensifySettings.split`."""
 
 
-def off_by_default(value: Any) -> Any:
+def off_by_default(value: Any, **limits: Any) -> Any:
     """Declare a setting whose default means "off". At its default it is in no cell's id."""
-    return field(default=value, metadata={"off": value})
+    return field(default=value, metadata={"off": value, **limits})
+
+
+def outside_limits(group: Any, path: str = "") -> Iterator[str]:
+    """Yield a message for each setting of a dataclass outside its limits; it begins with its key.
+
+    The limits are in the metadata of its field: `choices`, or `finite` of True, and the bounds
+    `least`, `above`, `most` and `below`. `path` is that of the group, with a dot at its end.
+    """
+    for key in fields(group):
+        value, limits = getattr(group, key.name), key.metadata
+        if value not in limits.get("choices", [value]):
+            yield f"{path}{key.name}={value}: must be one of {', '.join(limits['choices'])}"
+        bounds = [(words, limits[name], holds) for name, words, holds in _BOUNDS if name in limits]
+        finite = not limits.get("finite") or math.isfinite(value)
+        if not (finite and all(holds(value, bound) for _, bound, holds in bounds)):
+            rules = ["finite"] if limits.get("finite") else []
+            rules += [f"{words} {bound}" for words, bound, _ in bounds]
+            yield f"{path}{key.name}={value}: must be {' and '.join(rules)}"
+
+
+_BOUNDS = (
+    ("least", "at least", ge),
+    ("above", "above", gt),
+    ("most", "at most", le),
+    ("below", "below", lt),
+)
 
 
 @dataclass
@@ -97,7 +130,7 @@ class OptimizerSettings:
     """Rate of means at the first step, times the scene's scale; it decays exponentially."""
     means_final: float = 0.01
     """Rate of means after the last step, as a fraction of the first rate."""
-    means_decay_from: int = 0
+    means_decay_from: int = field(default=0, metadata={"least": 0, "below": NOMINAL_STEPS})
     """Step of a 30,000-step run at which the rate of means begins to decay; 0 is gsplat's."""
     scales: float = 5e-3
     """Rate of log scales."""
@@ -106,12 +139,12 @@ class OptimizerSettings:
     quats: float = 1e-3
     sh0: float = 2.5e-3
     shN: float = 2.5e-3 / 20  # noqa: N815
-    shN_every: int = 1  # noqa: N815
+    shN_every: int = field(default=1, metadata={"least": 1})  # noqa: N815
     """Steps between two updates of shN, whose rate is multiplied by this; 1 in gsplat."""
-    length_power: float = off_by_default(0.0)
+    length_power: float = off_by_default(0.0, least=0, most=1)
     """Power p, 0 to 1: in runs below 30,000 steps, the rates of scales, quats, sh0 and shN are
     multiplied by (30,000 / steps)^p (`SplatOptimizer`). 0 keeps gsplat's rates."""
-    length_decay_from: int = off_by_default(18_000)
+    length_decay_from: int = off_by_default(18_000, least=0, below=NOMINAL_STEPS)
     """Step of a 30,000-step run at which these rates begin to fall to gsplat's. Our choice."""
     beta1: float = 0.9
     """Decay of the first moment, per step."""
@@ -151,14 +184,14 @@ class DensifySettings:
     this times the scene's scale."""
     reset_opacity: float = 2.0
     """A reset caps opacities at this times `prune_opacity`."""
-    split: str = "random"
+    split: str = field(default="random", metadata={"choices": SPLITS})
     """How Gaussians grow. `random`: as in gsplat, small Gaussians are duplicated and large ones
     are split into two, with means drawn from the Gaussian. `long_axis`: all are split into two side
     by side along the longest axis (`xrgs.splat.strategy.ops.split_along_longest_axis`)."""
-    budget: float = off_by_default(0.0)
+    budget: float = off_by_default(0.0, finite=True, least=0)
     """Growth stops at this number of Gaussians, per pixel of the largest training view
     (`xrgs.splat.strategy.ops.Budget`); 0 sets no limit. The unit is our choice."""
-    noise: float = off_by_default(0.0)
+    noise: float = off_by_default(0.0, finite=True, least=0)
     """Size of the noise that `MCMCStrategy` adds to the means at every step, as a multiple of the
     learning rate of means. gsplat's is 5e5."""
 

@@ -2,7 +2,7 @@
 
 Section 7.2 of the paper finds XR-GS better on textured scenes and the baseline better on simple
 ones, and does not say how texture is measured. Here it is the mean magnitude of a photograph's
-gradient, which `xrgs.training.components.texture` defines [xrgs, section 7].
+gradient, which `xrgs.training.components.weighting` defines [xrgs, section 7].
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ FILE = "textures.json"
 def texture(image: NDArray[np.float32], mask: NDArray[np.bool_] | None = None) -> float:
     """Return the mean magnitude of an image's gradient, in intensity per px.
 
-    It is `xrgs.training.components.texture.mean_gradient`, always without the last row and column,
-    which repeat others there. That function needs torch; this one does not.
+    It is `mean_gradient` of `xrgs.training.components.weighting`, always without the last row and
+    column, which repeat others there. That function needs torch; this one does not.
 
     Args:
         image: [H, W, 3] in 0..1.

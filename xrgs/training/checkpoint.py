@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import logging
 import time
-import zipfile
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -145,10 +144,8 @@ def _save(file: Path, state: State) -> None:
     arrays: dict[str, NDArray[Any]] = {}
     text = json.dumps(_split_off_tensors(state, "", arrays))
     arrays[_JSON_MEMBER] = np.frombuffer(text.encode(), np.uint8)
-    with atomic_writer(file) as stream, zipfile.ZipFile(stream, "w") as archive:
-        for name, array in arrays.items():
-            with archive.open(name, "w", force_zip64=True) as member:
-                np.lib.format.write_array(member, array, allow_pickle=False)
+    with atomic_writer(file) as stream:
+        np.savez(stream, **arrays)
 
 
 def _split_off_tensors(state: State, path: str, arrays: dict[str, NDArray[Any]]) -> State:

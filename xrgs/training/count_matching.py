@@ -16,9 +16,10 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from xrgs.errors import XrgsError
+from xrgs.splat.settings import outside_limits
 from xrgs.splat.torch_defaults import on_cpu_in_float32
 from xrgs.training.checkpoint import Checkpoint
-from xrgs.training.components.base import Component, Step, check_not_negative
+from xrgs.training.components.base import Component, Step
 from xrgs.training.loop import train
 
 if TYPE_CHECKING:
@@ -48,6 +49,10 @@ def train_cell(
 ) -> TrainingResult:
     """Train a config: several times if count matching is on, else once.
 
+    With count matching, `splat.densify.grow_grad2d` is the first threshold, and the result's
+    `grow_grad2d` the matching one. `splat.strategy=mcmc` has no threshold: the number is its
+    budget. The checkpoint includes the search.
+
     Args:
         data: The training views and the SfM points.
         conf: The config.
@@ -67,27 +72,11 @@ def train_cell(
         >>> save_gaussians("trained.ply", result.gaussians)
     """
     count_matched = conf.components.count_matched
-    check_not_negative("components.count_matched.gaussians", count_matched.gaussians)
-    check_not_negative("components.count_matched.tolerance", count_matched.tolerance)
+    for message in outside_limits(count_matched, "components.count_matched."):
+        raise XrgsError(message)
     if count_matched.gaussians == 0:
         return train(data, conf, checkpoint, evaluate=evaluate)
-    return train_count_matched(data, conf, checkpoint, evaluate)
-
-
-def train_count_matched(
-    data: Dataset,
-    conf: Conf,
-    checkpoint: Checkpoint | None = None,
-    evaluate: Evaluate | None = None,
-) -> TrainingResult:
-    """Train as `train_cell`, with a number of Gaussians above 0.
-
-    `splat.densify.grow_grad2d` is the first threshold, and the result's `grow_grad2d` the matching
-    one. `splat.strategy=mcmc` has no threshold: the number is its budget. The checkpoint includes
-    the search.
-    """
-    checkpoint = checkpoint or Checkpoint()
-    count_matched, densify = conf.components.count_matched, conf.splat.densify
+    checkpoint, densify = checkpoint or Checkpoint(), conf.splat.densify
     count_check = CountCheck(count_matched.gaussians, count_matched.tolerance, densify.stop)
 
     def train_with(**changed: Any) -> TrainingResult:

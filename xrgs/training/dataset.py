@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from xrgs.config import TRAINING_VIEWS
 from xrgs.errors import XrgsError
 from xrgs.photos import images, masks
 from xrgs.runtime.progress import progress
@@ -19,8 +20,6 @@ if TYPE_CHECKING:
 
     from xrgs.mixture.views import Variant, View
 
-#: Allowed values of `train.views`, the training views of a cell.
-USES = ("mixed", "all_hr", "hr_only", "lr_only")
 #: Least number of HR training views after `train.validation` holds some out; our choice.
 _MIN_HR_LEFT = 2
 
@@ -165,8 +164,8 @@ def _held_out(variant: Variant, share: float, seed: int) -> list[View]:
 
 def _training_views(variant: Variant, use: str) -> list[View]:
     """Select the training views for `use`, in the variant's order."""
-    if use not in USES:
-        raise XrgsError(f"train.views={use}: must be one of {', '.join(USES)}")
+    if use not in TRAINING_VIEWS:
+        raise XrgsError(f"train.views={use}: must be one of {', '.join(TRAINING_VIEWS)}")
     views = [view for view in variant.views if view.split == "train"]
     if use == "mixed":
         return views

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 
 from xrgs.runtime.progress import progress
 from xrgs.splat.backend import device, resolve_backend
-from xrgs.splat.gaussians import PARAMETERS, Gaussians, from_points
+from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.splat.loss import Target, photometric_loss, prepare_target
 from xrgs.splat.optimizer import SplatOptimizer
 from xrgs.splat.rendering import zero_means2d_offset
 from xrgs.splat.settings import NOMINAL_STEPS
+from xrgs.splat.strategy.base import Refinement
 from xrgs.splat.strategy.default import DefaultStrategy
 from xrgs.splat.strategy.mcmc import MCMCStrategy
-from xrgs.splat.strategy.refinement import Refinement
 from xrgs.training.checkpoint import Checkpoint
 from xrgs.training.components import Components
 from xrgs.training.components import build as build_components
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 
     from torch import Tensor
 
-    from xrgs.config import Conf, SplatConf
+    from xrgs.config import Conf
     from xrgs.splat.cameras import Camera
     from xrgs.splat.rendering import Render
     from xrgs.splat.strategy.base import Strategy
@@ -74,9 +75,9 @@ def train(
             components exclude every view, or the backend can't be used on this machine.
     """
     checkpoint = checkpoint or Checkpoint()
-    run = _set_up(data, conf, extra_components)
+    run = _Run(data, conf, extra_components)
     run.components.before_training(run.renderer)
-    run.components.on_gaussians_changed(run.optimizer.gaussians)
+    run.components.on_gaussians_changed(run.gaussians)
     # All objects that a step changes. The optimizer is first: it restores the Gaussians, and the
     # other states must fit their number.
     checkpoint.register(
@@ -87,11 +88,10 @@ def train(
         recorder=run.recorder,
         memory=run.memory,
     )
-    _run_steps(run, checkpoint, evaluate)
-    gaussians = run.optimizer.gaussians
-    run.components.bake(gaussians)
-    run.components.after_training(gaussians)
-    return run.recorder.finish(gaussians.to("cpu"), run.memory.largest_bytes)
+    run.steps(checkpoint, evaluate)
+    run.components.bake(run.gaussians)
+    run.components.after_training(run.gaussians)
+    return run.recorder.finish(run.gaussians.to("cpu"), run.memory.largest_bytes)
 
 
 class _Views:
@@ -124,43 +124,7 @@ class _Views:
         return target.mean, target.variance
 
 
-@dataclass(frozen=True)
-class _Run:
-    """The objects of one run."""
-
-    splat: SplatConf
-    steps: int
-    evaluate_every: int
-    """Steps of this run between two evaluations; 0 evaluates nothing."""
-    backend: str
-    views: _Views
-    optimizer: SplatOptimizer
-    components: Components
-    strategy: Strategy
-    sampler: EpochSampler
-    recorder: TrainingRecorder
-    renderer: StepRenderer
-    memory: TrainingMemory
-
-    def evaluates_after(self, step: int) -> bool:
-        # Not after the last step, since the caller scores the trained Gaussians.
-        done, every = step + 1, self.evaluate_every
-        return bool(every) and done % every == 0 and done < self.steps
-
-    def score(self, evaluate: Evaluate) -> Callable[[], Mapping[str, float | None]]:
-        """Return a function that bakes a copy of the Gaussians and scores it."""
-        gaussians = self.optimizer.gaussians
-
-        def scores() -> Mapping[str, float | None]:
-            copy = Gaussians(**{name: gaussians[name].detach().clone() for name in PARAMETERS})
-            self.components.bake(copy)
-            return evaluate(copy)
-
-        return scores
-
-
-@dataclass(frozen=True)
-class _Forward:
+class _Forward(NamedTuple):
     """The result of a step's forward pass."""
 
     camera: Camera
@@ -173,100 +137,148 @@ class _Forward:
     """Scalar."""
 
 
-def _run_steps(run: _Run, checkpoint: Checkpoint, evaluate: Evaluate | None) -> None:
-    components, sampler, recorder = run.components, run.sampler, run.recorder
-    gaussians = run.optimizer.gaussians
-    for sampled in progress(sampler, "training", "step", run.steps, done=sampler.next_step):
-        run.views.change_to(components.training_views(run.views.own, sampled))
-        step = replace(sampled, view=run.views.present[sampled.view.name])
-        forward = _forward(run, step)
-        recorder.lap("forward")
-        # Update the Gaussians, and record the step while its gradients and buffers still exist.
-        if components.needs_backward(forward.loss, step):
-            _update(run, step, forward)
-            run.memory.record(forward.render)
-        else:
-            run.optimizer.skip_step()
-            recorder.record_skipped("backward")
-        recorder.record_step(step, forward.loss, forward.render, gaussians, forward.sh_degree)
-        recorder.record_refinement(_densify(run, step, forward))
-        components.after_step(gaussians, step)
-        # Evaluation and checkpoints do not count as training time.
-        if evaluate is not None and run.evaluates_after(step.number):
-            recorder.record_scores(step.number + 1, len(gaussians), run.score(evaluate))
-        recorder.exclude_time(checkpoint.save_if_due(step.number))
+class _Run:
+    """The objects of one run, and its steps."""
 
-
-def _forward(run: _Run, step: Step) -> _Forward:
-    """Render the view of a step, and compute the loss against its photograph."""
-    components, gaussians, ssim = run.components, run.optimizer.gaussians, run.splat.ssim_weight
-    camera = components.render_camera(step.view.camera, step)
-    sh_degree = run.renderer.sh_degree(step)
-    means2d_offset = zero_means2d_offset(len(gaussians), gaussians.means.device)
-    target, kept = run.views.target(step.view), step.view.name in run.views.moments.kept
-    with run.memory.of_forward(step, len(gaussians), sh_degree, kept=kept):
-        render = run.renderer.render(gaussians, step, camera, means2d_offset)
-        # Loss: L1 and SSIM against the photograph, then terms and weights of the components.
-        image = components.match_colors(components.to_photograph(render.image, step), step)
-        image = inside_mask(image, target.image, step.view.mask)
-        weights = components.pixel_weights(step)
-        loss = photometric_loss(
-            image, target, l1=1 - ssim, ssim=ssim, pixel_weight=weights, backend=run.backend
+    def __init__(self, data: Dataset, conf: Conf, extra_components: Iterable[Component]) -> None:
+        self.splat, self.train = conf.splat, conf.train
+        self.backend = resolve_backend(conf.splat.backend)
+        splat, steps, backend = self.splat, self.train.steps, self.backend
+        first, start_seconds = _first_gaussians(data, conf, backend)
+        place = device(backend)
+        self.gaussians = first.to(place)
+        # The points stay on the CPU, since they are used only once.
+        data = replace(data, train=tuple(view.to(place) for view in data.train))
+        self.optimizer = SplatOptimizer(
+            self.gaussians,
+            splat.optimizer,
+            scene_scale=data.scene_scale,
+            steps=steps,
+            backend=backend,
         )
-        loss = components.modify_loss(loss, image, gaussians, step)
-    return _Forward(camera, sh_degree, means2d_offset, render, loss)
+        built = build_components(conf.components, data, splat, backend, conf.seed)
+        self.components = Components([*built, *extra_components])
+        self.components.check_strategy(splat.strategy, STRATEGIES[splat.strategy])
+        self.strategy = STRATEGIES[splat.strategy](
+            self.optimizer,
+            splat.densify.scaled(steps),
+            scene_scale=data.scene_scale,
+            generator=seeded_generator(conf.seed, "densify"),
+            groups=self.components.densification_groups(splat.densify),
+            view_pixels=data.view_pixels,
+        )
+        self.views = _Views(data.train, backend)
+        # Last of what takes time, since its clock starts here.
+        self.recorder = TrainingRecorder(
+            steps, splat.densify.grow_grad2d, data.train, start_seconds
+        )
+        self.sampler = EpochSampler(
+            data.train, conf.seed, steps, self.components.allows_view, self.train.hr_share
+        )
+        sh_every = max(1, int(splat.sh_every * steps / NOMINAL_STEPS))
+        self.renderer = StepRenderer(
+            self.components, splat.raster, sh_every, backend, self.recorder
+        )
+        holders = (self.optimizer, self.strategy, self.components, self.views, data)
+        self.memory = TrainingMemory(*holders, device=place)
 
+    def steps(self, checkpoint: Checkpoint, evaluate: Evaluate | None) -> None:
+        """Run all steps that are left."""
+        components, sampler, recorder = self.components, self.sampler, self.recorder
+        for sampled in progress(
+            sampler, "training", "step", self.train.steps, done=sampler.next_step
+        ):
+            self.views.change_to(components.training_views(self.views.own, sampled))
+            step = replace(sampled, view=self.views.present[sampled.view.name])
+            forward = self._forward(step)
+            recorder.lap("forward")
+            # Update the Gaussians, and record the step while its gradients and buffers still exist.
+            if components.needs_backward(forward.loss, step):
+                self._update(step, forward)
+                self.memory.record(forward.render)
+            else:
+                self.optimizer.skip_step()
+                recorder.record_skipped("backward")
+            recorder.record_step(
+                step, forward.loss, forward.render, self.gaussians, forward.sh_degree
+            )
+            recorder.record_refinement(self._densify(step, forward))
+            components.after_step(self.gaussians, step)
+            # Evaluation and checkpoints do not count as training time. The caller scores the
+            # trained Gaussians.
+            done, every = step.number + 1, self.train.evaluate_every
+            if evaluate is not None and every and done % every == 0 and done < self.train.steps:
+                recorder.record_scores(done, len(self.gaussians), partial(self._scores, evaluate))
+            recorder.exclude_time(checkpoint.save_if_due(step.number))
 
-def _update(run: _Run, step: Step, forward: _Forward) -> None:
-    """Run the backward pass, the components' changes of gradients, and the optimizer's step."""
-    run.optimizer.zero_grad()
-    torch.autograd.backward(forward.loss)
-    run.components.after_backward(run.optimizer.gaussians, step)
-    run.recorder.lap("backward")
-    if not run.optimizer.moves_harmonics:
-        run.recorder.record_skipped("shN")
-    run.optimizer.step(forward.camera, sh_degree=forward.sh_degree)
-    run.recorder.lap("optimizer")
+    def _scores(self, evaluate: Evaluate) -> Mapping[str, float | None]:
+        """Bake a copy of the Gaussians and score it."""
+        values = {name: self.gaussians[name].detach().clone() for name in PARAMETERS}
+        copy = Gaussians(**values)
+        self.components.bake(copy)
+        return evaluate(copy)
 
+    def _forward(self, step: Step) -> _Forward:
+        """Render the view of a step, and compute the loss against its photograph."""
+        components, gaussians, ssim = self.components, self.gaussians, self.splat.ssim_weight
+        camera = components.render_camera(step.view.camera, step)
+        sh_degree = self.renderer.sh_degree(step)
+        means2d_offset = zero_means2d_offset(len(gaussians), gaussians.means.device)
+        target, kept = self.views.target(step.view), step.view.name in self.views.moments.kept
+        with self.memory.of_forward(step, len(gaussians), sh_degree, kept=kept):
+            render = self.renderer.render(gaussians, step, camera, means2d_offset)
+            # Loss: L1 and SSIM against the photograph, then terms and weights of the components.
+            image = components.match_colors(components.to_photograph(render.image, step), step)
+            image = inside_mask(image, target.image, step.view.mask)
+            weights = components.pixel_weights(step)
+            loss = photometric_loss(
+                image, target, l1=1 - ssim, ssim=ssim, pixel_weight=weights, backend=self.backend
+            )
+            loss = components.modify_loss(loss, image, gaussians, step)
+        return _Forward(camera, sh_degree, means2d_offset, render, loss)
 
-def _densify(run: _Run, step: Step, forward: _Forward) -> Refinement:
-    """Densify, prune and reset; return the counts."""
-    # None without a backward pass, or if the render shows no Gaussian.
-    grad2d, camera = forward.means2d_offset.grad, forward.camera
-    visible = forward.render.visible
-    if grad2d is not None:
-        if step.view.mask is not None:  # masked pixels show no Gaussian
-            visible = visible & (grad2d != 0).any(dim=1)
-        grad2d = run.components.densification_grad2d(grad2d, step)
-    refinement = run.strategy.after_step(
-        step.number,
-        grad2d,
-        visible,
-        width=camera.width,
-        height=camera.height,
-        group=step.view.tag,
-        hooks=run.components.strategy_hooks(step),
-    )
-    if refinement != Refinement():
-        run.components.on_gaussians_changed(run.optimizer.gaussians)
-    return _prune_by_components(run, step, refinement)
+    def _update(self, step: Step, forward: _Forward) -> None:
+        """Run the backward pass, the components' changes of gradients, and the optimizer's step."""
+        self.optimizer.zero_grad()
+        torch.autograd.backward(forward.loss)
+        self.components.after_backward(self.gaussians, step)
+        self.recorder.lap("backward")
+        if not self.optimizer.moves_harmonics:
+            self.recorder.record_skipped("shN")
+        self.optimizer.step(forward.camera, sh_degree=forward.sh_degree)
+        self.recorder.lap("optimizer")
 
-
-def _prune_by_components(run: _Run, step: Step, refinement: Refinement) -> Refinement:
-    """Remove the Gaussians that components choose, and add their number to the step's counts."""
-    gaussians = run.optimizer.gaussians
-    mask = run.components.to_prune(gaussians, step)
-    if mask is None or not mask.any():
-        return refinement
-    removed = run.strategy.remove(mask)
-    run.components.on_gaussians_changed(gaussians)
-    return replace(refinement, pruned_by_components=removed)
+    def _densify(self, step: Step, forward: _Forward) -> Refinement:
+        """Densify, prune and reset; return the counts."""
+        # None without a backward pass, or if the render shows no Gaussian.
+        grad2d, visible = forward.means2d_offset.grad, forward.render.visible
+        if grad2d is not None:
+            if step.view.mask is not None:  # masked pixels show no Gaussian
+                visible = visible & (grad2d != 0).any(dim=1)
+            grad2d = self.components.densification_grad2d(grad2d, step)
+        refinement = self.strategy.after_step(
+            step.number,
+            grad2d,
+            visible,
+            width=forward.camera.width,
+            height=forward.camera.height,
+            group=step.view.tag,
+            hooks=self.components.strategy_hooks(step),
+        )
+        if refinement != Refinement():
+            self.components.on_gaussians_changed(self.gaussians)
+        to_prune = self.components.to_prune(self.gaussians, step)
+        if to_prune is None or not to_prune.any():
+            return refinement
+        removed = self.strategy.remove(to_prune)
+        self.components.on_gaussians_changed(self.gaussians)
+        return replace(refinement, pruned_by_components=removed)
 
 
 def _first_gaussians(data: Dataset, conf: Conf, backend: str) -> tuple[Gaussians, float]:
     """Create the first Gaussians; return them and the time of a dense start, seconds."""
     splat = conf.splat
-    sparse = from_points(
+    sparse = Gaussians.from_points(
         data.points,
         data.colors,
         init_opacity=splat.init_opacity,
@@ -281,49 +293,3 @@ def _first_gaussians(data: Dataset, conf: Conf, backend: str) -> tuple[Gaussians
     began = time.perf_counter()
     gaussians = dense_start(data, sparse, backend, seeded_generator(conf.seed, "dense"))
     return gaussians, time.perf_counter() - began
-
-
-def _set_up(data: Dataset, conf: Conf, extra_components: Iterable[Component]) -> _Run:
-    splat, steps = conf.splat, conf.train.steps
-    backend = resolve_backend(splat.backend)
-    gaussians, start_seconds = _first_gaussians(data, conf, backend)
-    place = device(backend)
-    gaussians = gaussians.to(place)
-    # The points stay on the CPU, since they are used only once.
-    data = replace(data, train=tuple(view.to(place) for view in data.train))
-    optimizer = SplatOptimizer(
-        gaussians, splat.optimizer, scene_scale=data.scene_scale, steps=steps, backend=backend
-    )
-    built = build_components(conf.components, data, splat, backend, conf.seed)
-    components = Components([*built, *extra_components])
-    components.check_strategy(splat.strategy, STRATEGIES[splat.strategy])
-    strategy = STRATEGIES[splat.strategy](
-        optimizer,
-        splat.densify.scaled(steps),
-        scene_scale=data.scene_scale,
-        generator=seeded_generator(conf.seed, "densify"),
-        groups=components.densification_groups(splat.densify),
-        view_pixels=data.view_pixels,
-    )
-    views = _Views(data.train, backend)
-    # Last, since its clock starts here.
-    recorder = TrainingRecorder(steps, splat.densify.grow_grad2d, data.train)
-    if start_seconds:
-        recorder.add_start(start_seconds)
-    sh_every = max(1, int(splat.sh_every * steps / NOMINAL_STEPS))
-    return _Run(
-        splat=splat,
-        steps=steps,
-        evaluate_every=conf.train.evaluate_every,
-        backend=backend,
-        views=views,
-        optimizer=optimizer,
-        components=components,
-        strategy=strategy,
-        sampler=EpochSampler(
-            data.train, conf.seed, steps, components.allows_view, conf.train.hr_share
-        ),
-        recorder=recorder,
-        renderer=StepRenderer(components, splat.raster, sh_every, backend, recorder),
-        memory=TrainingMemory(optimizer, strategy, components, views, data, device=place),
-    )

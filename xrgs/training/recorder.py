@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from xrgs.runtime.machine import wait_for_gpu
 from xrgs.splat.sh import bases
-from xrgs.splat.strategy.refinement import Refinement
+from xrgs.splat.strategy.base import Refinement
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
@@ -78,9 +78,19 @@ class TrainingRecorder:
     Its clock starts when it is constructed.
     """
 
-    def __init__(self, steps: int, grow_grad2d: float, views: Iterable[TrainingView]) -> None:
-        """Start the clock of a run of `steps` steps, with an empty history."""
-        self.started = self.lap_started = time.perf_counter()
+    def __init__(
+        self,
+        steps: int,
+        grow_grad2d: float,
+        views: Iterable[TrainingView],
+        start_seconds: float = 0.0,
+    ) -> None:
+        """Start the clock of a run of `steps` steps, with an empty history.
+
+        `start_seconds` is the time of a dense start, which is part of the training time.
+        """
+        self.lap_started = time.perf_counter()
+        self.started = self.lap_started - start_seconds
         self.grow_grad2d = grow_grad2d
         self.row_every = max(1, steps // _HISTORY_ROWS)
         self.last_step = steps - 1
@@ -94,7 +104,7 @@ class TrainingRecorder:
         """View name -> number of pixels of its photograph."""
         self.trained: set[str] = set()
         """Names of the views that were trained on."""
-        self.stage_seconds: defaultdict[str, float] = defaultdict(float)
+        self.stage_seconds = defaultdict(float, {"start": start_seconds} if start_seconds else {})
 
     def lap(self, stage: str) -> None:
         """Add the time since the last lap, or since the start, to a stage."""
@@ -102,11 +112,6 @@ class TrainingRecorder:
         now = time.perf_counter()
         self.stage_seconds[stage] += now - self.lap_started
         self.lap_started = now
-
-    def add_start(self, seconds: float) -> None:
-        """Add time before the clock was started to the training time, as stage `start`."""
-        self.started -= seconds
-        self.stage_seconds["start"] += seconds
 
     def record_skipped(self, part: str) -> None:
         """Count a skipped `backward` or `shN` of a step; call it before `record_step`."""

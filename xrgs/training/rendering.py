@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from xrgs.splat.attribution import attribute_pixels
-from xrgs.splat.rendering import Render, rasterize_parameters
+from xrgs.splat.rendering import Render, attribute_pixels, rasterize_parameters
 
 if TYPE_CHECKING:
     from xrgs.splat.cameras import Camera

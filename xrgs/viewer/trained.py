@@ -14,9 +14,8 @@ import torch
 from numpy.typing import NDArray
 
 from xrgs.errors import XrgsError
-from xrgs.splat.attribution import attribute_pixels
 from xrgs.splat.backend import resolve_backend
-from xrgs.splat.rendering import rasterize
+from xrgs.splat.rendering import attribute_pixels, rasterize
 from xrgs.splat.sh import C0
 from xrgs.training import dataset
 

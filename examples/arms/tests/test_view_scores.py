@@ -15,9 +15,8 @@ from examples.arms.tests.conftest import with_arms
 from tests.training.components.conftest import renderer_of
 from xrgs.config import ComponentsConf
 from xrgs.errors import XrgsError
-from xrgs.splat.attribution import attribute_pixels
 from xrgs.splat.gaussians import ActivatedGaussians, Gaussians
-from xrgs.splat.rendering import rasterize_parameters
+from xrgs.splat.rendering import attribute_pixels, rasterize_parameters
 from xrgs.splat.settings import RasterSettings
 from xrgs.splat.strategy.mcmc import MCMCStrategy
 from xrgs.training.components import Components, Step

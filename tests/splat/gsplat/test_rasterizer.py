@@ -23,9 +23,8 @@ from tests.gsplat_stand_in import stand_in
 from tests.splat.scenes import Scene, draw, gradients_of, make_camera, make_scene, with_gradients
 from xrgs.errors import XrgsError
 from xrgs.splat import backend
-from xrgs.splat.attribution import attribute_pixels
 from xrgs.splat.gaussians import PARAMETERS, ActivatedGaussians
-from xrgs.splat.rendering import Render, zero_means2d_offset
+from xrgs.splat.rendering import Render, attribute_pixels, zero_means2d_offset
 from xrgs.splat.settings import RasterSettings
 
 pytest.importorskip("xrgs._native", reason="the kernels were not built")

@@ -25,7 +25,7 @@ from torch import Tensor
 from tests.splat.native import oracle
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import PARAMETERS, ActivatedGaussians
-from xrgs.splat.native.rasterizer import render_culled
+from xrgs.splat.native import rasterizer
 from xrgs.splat.quaternions import rotation_matrices
 from xrgs.splat.rendering import Render
 from xrgs.splat.settings import CullingOptions, RasterSettings
@@ -353,13 +353,13 @@ def render(scene: Scene) -> tuple[Render, dict[str, Tensor]]:
         name: value.detach().requires_grad_(needed)
         for (name, value), needed in zip(scene.tensors().items(), scene.needed, strict=False)
     }
-    rendered = render_culled(
+    rendered = rasterizer.render(
         ActivatedGaussians(*(leaves[name] for name in PARAMETERS)),
         scene.camera,
         scene.settings,
         scene.sh_degree,
         leaves.get("means2d_offset"),
-        scene.culling,
+        culling=scene.culling,
     )
     return rendered, {name: leaf for name, leaf in leaves.items() if leaf.requires_grad}
 

@@ -216,5 +216,5 @@ def test_other_types_and_missing_bands_are_refused() -> None:
         take_step_of_a_view(of, normal_parameters(5, 1), 2)
     of.reset("means", of.gaussians.means.detach().double())
     of.gaussians.means.grad = torch.zeros(5, 3, dtype=torch.float64)
-    with pytest.raises(ValueError, match="means and its gradient must be float32"):
+    with pytest.raises(ValueError, match="means must be float32 on the CPU"):
         of.step()

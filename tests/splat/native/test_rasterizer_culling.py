@@ -23,10 +23,11 @@ def render_with(
     culling: CullingOptions, scene: Scene, camera: Camera
 ) -> tuple[Render, Scene, dict[str, int]]:
     """The render, its gradients, and the work that each kind of culling lessens."""
-    from xrgs.splat.native.rasterizer import render_culled
+    from xrgs.splat.native.rasterizer import render
 
     leaves = with_gradients(scene)
-    done = render_culled(ActivatedGaussians(**leaves), camera, RasterSettings(), 3, None, culling)
+    gaussians = ActivatedGaussians(**leaves)
+    done = render(gaussians, camera, RasterSettings(), 3, None, culling=culling)
     graph: Any = done.image.grad_fn
     frame = graph.frame
     work = {

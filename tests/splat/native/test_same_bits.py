@@ -15,7 +15,7 @@ from torch import Tensor
 from tests.splat.scenes import make_camera, make_scene, noise, normal_parameters
 from xrgs.splat.gaussians import PARAMETERS, ActivatedGaussians, Gaussians
 from xrgs.splat.loss import photometric_loss, prepare_target
-from xrgs.splat.native import activations, densify
+from xrgs.splat.native import elementwise
 from xrgs.splat.optimizer import SplatOptimizer
 from xrgs.splat.rendering import rasterize_parameters
 from xrgs.splat.resample import resize
@@ -28,7 +28,7 @@ def activate() -> list[Tensor]:
     # torch divides its own work among threads from 32,768 elements on.
     raw = normal_parameters(100_003, 0, size=10)
     leaves = [raw[name].requires_grad_() for name in ("scales", "opacities")]
-    both = activations.activate(*leaves)
+    both = elementwise.exp(leaves[0]), elementwise.logistic(leaves[1])
     return [*both, *torch.autograd.grad(both, leaves, [value.cos() for value in both])]
 
 
@@ -37,7 +37,7 @@ def statistics() -> list[Tensor]:
     gradient = 1e-4 * torch.randn(40_001, 2, generator=generator)
     visible = torch.rand(40_001, generator=generator) < 0.6
     sums = torch.zeros(40_001), torch.zeros(40_001)
-    densify.accumulate_statistics(gradient, visible, (50.0, 37.5), *sums)
+    elementwise.accumulate_statistics(gradient, visible, (50.0, 37.5), *sums)
     return list(sums)
 
 

@@ -16,7 +16,7 @@ from tests.splat.scenes import (
     normal_parameters,
     take_step,
 )
-from xrgs.splat.native.densify import accumulate_statistics
+from xrgs.splat.native.elementwise import accumulate_statistics
 from xrgs.splat.native.rasterizer import render_config
 from xrgs.splat.native.resample import banded_matrix
 from xrgs.splat.settings import CullingOptions, RasterSettings

@@ -15,8 +15,8 @@ from tests.splat.scenes import make_strategy, take_step
 from tests.splat.strategy.gsplats import SCENE_SCALE, SIZES, Theirs, View, random_values
 from xrgs.splat.gaussians import PARAMETERS
 from xrgs.splat.settings import DensifySettings
+from xrgs.splat.strategy.base import Refinement
 from xrgs.splat.strategy.default import DefaultStrategy
-from xrgs.splat.strategy.refinement import Refinement
 
 
 def random_start(count: int, rng: np.random.Generator) -> dict[str, Tensor]:

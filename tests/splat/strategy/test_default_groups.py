@@ -15,7 +15,7 @@ from tests.splat.scenes import make_strategy
 from tests.splat.strategy.gsplats import SCENE_SCALE, SIZES, Theirs, View, random_values
 from xrgs.splat.gaussians import Gaussians
 from xrgs.splat.settings import DensifySettings
-from xrgs.splat.strategy.refinement import Groups, Refinement, Thresholds
+from xrgs.splat.strategy.base import Groups, Refinement, Thresholds
 
 FINE, COARSE = Thresholds(2e-4, 0.005), Thresholds(4e-4, 0.02)
 

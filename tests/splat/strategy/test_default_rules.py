@@ -12,8 +12,8 @@ from tests.splat.scenes import make_strategy, take_step
 from tests.splat.strategy.gsplats import SCENE_SCALE, SIZES, View
 from xrgs.splat.gaussians import PARAMETERS
 from xrgs.splat.settings import DensifySettings
+from xrgs.splat.strategy.base import Groups, Refinement, StrategyHooks, Thresholds
 from xrgs.splat.strategy.default import DefaultStrategy
-from xrgs.splat.strategy.refinement import Groups, Refinement, StrategyHooks, Thresholds
 
 WIDTH, HEIGHT = SIZES["HR"]
 NO_HOOKS = StrategyHooks()

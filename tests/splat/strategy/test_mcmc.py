@@ -14,8 +14,8 @@ from tests.splat.scenes import make_optimizer, take_step
 from tests.splat.strategy.gsplats import SCENE_SCALE, TheirsMCMC, random_values, relocation
 from xrgs.splat.gaussians import PARAMETERS
 from xrgs.splat.settings import STRATEGIES, DensifySettings
+from xrgs.splat.strategy.base import Groups, Refinement, Thresholds
 from xrgs.splat.strategy.mcmc import MOST_SHARES, MCMCStrategy, share_out
-from xrgs.splat.strategy.refinement import Groups, Refinement, Thresholds
 from xrgs.training import loop
 
 SETTINGS = DensifySettings(stop=25_000, budget=1.0, noise=5e5)

@@ -15,9 +15,9 @@ from tests.splat.scenes import make_strategy
 from tests.splat.strategy.gsplats import random_values
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.splat.settings import DensifySettings
+from xrgs.splat.strategy.base import Refinement, StrategyHooks
 from xrgs.splat.strategy.default import DefaultStrategy
 from xrgs.splat.strategy.ops import Budget, split_along_longest_axis, top_k
-from xrgs.splat.strategy.refinement import Refinement, StrategyHooks
 
 SIDE = 20
 

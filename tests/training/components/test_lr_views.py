@@ -11,8 +11,8 @@ from tests.training.components.conftest import Build, gaussians_with_gradients, 
 from xrgs.config import ComponentsConf
 from xrgs.errors import XrgsError
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
-from xrgs.splat.settings import DensifySettings
-from xrgs.splat.strategy.refinement import DECIDE, Groups, Thresholds
+from xrgs.splat.settings import DECIDE, DensifySettings
+from xrgs.splat.strategy.base import Groups, Thresholds
 from xrgs.training.components import Step
 
 # Gradient scaling (5.3).

@@ -19,10 +19,10 @@ from xrgs.splat.cameras import Camera
 from xrgs.splat.loss import photometric_loss, prepare_target
 from xrgs.training import components
 from xrgs.training.components import Component, Components, Step, TrainingView
-from xrgs.training.components.texture import gradient_magnitude
 from xrgs.training.components.weighting import (
     Weighting,
     coverage,
+    gradient_magnitude,
     region_attenuations,
     scheduled_attenuation,
 )

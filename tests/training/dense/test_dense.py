@@ -14,7 +14,7 @@ from tests.conftest import composed as compose
 from tests.training.conftest import comparable, same
 from tests.training.dense.conftest import TrueScene
 from xrgs.splat.backend import resolve_backend
-from xrgs.splat.gaussians import Gaussians, from_points
+from xrgs.splat.gaussians import Gaussians
 from xrgs.training import dense
 from xrgs.training.checkpoint import Checkpoint
 from xrgs.training.dataset import Dataset
@@ -27,7 +27,7 @@ def start(data: Dataset) -> tuple[Gaussians, Gaussians]:
     """The Gaussians on SfM points, and those that training starts from."""
     generator = torch.Generator().manual_seed(0)
     points = data.points, data.colors
-    sparse = from_points(*points, init_opacity=0.1, sh_degree=3, generator=generator)
+    sparse = Gaussians.from_points(*points, init_opacity=0.1, sh_degree=3, generator=generator)
     return sparse, dense.dense_start(data, sparse, BACKEND, torch.Generator().manual_seed(1))
 
 

@@ -20,7 +20,7 @@ from xrgs.splat.gaussians import ActivatedGaussians
 from xrgs.splat.rendering import Render, is_zero_offset
 from xrgs.splat.settings import RasterSettings
 from xrgs.splat.sh import bases
-from xrgs.splat.torch.activations import activated
+from xrgs.splat.torch.elementwise import activated
 
 
 def _load() -> Any:

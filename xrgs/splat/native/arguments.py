@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 from torch.utils.dlpack import to_dlpack  # type: ignore[attr-defined]
@@ -20,10 +22,14 @@ def require_float32(name: str, value: Tensor) -> None:
         )
 
 
-def require_contiguous(name: str, value: Tensor) -> None:
-    """Raise ValueError unless a tensor that a kernel changes in place is float32 and contiguous."""
+def contiguous_handle(name: str, value: Tensor) -> Any:
+    """Return `handle` of a tensor that a kernel does not copy.
+
+    ValueError, naming the tensor, unless it is float32 on the CPU, and contiguous.
+    """
     require_float32(name, value)
     if not value.is_contiguous():
         raise ValueError(
             f"{name} must be contiguous for the native backend, got strides {value.stride()}"
         )
+    return handle(value)

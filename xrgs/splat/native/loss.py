@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from xrgs import _native
+from xrgs.splat.loss import WEIGHTS, Target
 from xrgs.splat.native.arguments import handle, require_float32
-from xrgs.splat.ssim import WEIGHTS, Target
 
 _WINDOW = torch.tensor(WEIGHTS, dtype=torch.float64, device="cpu")
 

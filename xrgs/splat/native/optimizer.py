@@ -9,7 +9,7 @@ from torch import Tensor
 
 from xrgs import _native
 from xrgs.splat.gaussians import PARAMETERS
-from xrgs.splat.native.arguments import handle
+from xrgs.splat.native.arguments import contiguous_handle
 
 if TYPE_CHECKING:
     from xrgs.splat.cameras import Camera
@@ -35,8 +35,9 @@ def step(optimizer: SplatOptimizer, camera: Camera | None = None, sh_degree: int
         if parameter.grad is None:
             continue
         exp_avg, exp_avg_sq, number = optimizer.adam_of(name)
-        tensors = (parameter, parameter.grad, exp_avg, exp_avg_sq)
-        handles = (_plain_handle(name, tensor) for tensor in tensors)
+        tensors = {name: parameter, f"the gradient of {name}": parameter.grad}
+        tensors |= {"exp_avg": exp_avg, "exp_avg_sq": exp_avg_sq}
+        handles = (contiguous_handle(*named) for named in tensors.items())
         entries.append((*handles, optimizer.rates[name], number.add_(1).item()))
         moved.append(parameter)
     settings, threads = optimizer.settings, torch.get_num_threads()
@@ -53,21 +54,11 @@ def _harmonics(
     gaussians = optimizer.gaussians
     exp_avg, exp_avg_sq, number = optimizer.adam_of("shN")
     return (
-        *(_plain_handle("shN", x) for x in (gaussians.shN, exp_avg, exp_avg_sq)),
-        _plain_handle("means", gaussians.means),
-        _plain_handle("sh0", gradient),
+        *(contiguous_handle("shN", x) for x in (gaussians.shN, exp_avg, exp_avg_sq)),
+        contiguous_handle("means", gaussians.means),
+        contiguous_handle("the gradient of sh0", gradient),
         camera.numbers.position,
         sh_degree,
         optimizer.rates["shN"],
         number.add_(1).item(),
     )
-
-
-def _plain_handle(name: str, value: Tensor) -> Any:
-    """Return the tensor's DLPack capsule; ValueError unless float32, contiguous, on the CPU."""
-    if value.dtype != torch.float32 or value.device.type != "cpu" or not value.is_contiguous():
-        raise ValueError(
-            f"{name} and its gradient must be float32, contiguous, on the CPU for the native"
-            f" optimizer, got {value.dtype} on {value.device}, strides {value.stride()}"
-        )
-    return handle(value)

@@ -26,6 +26,7 @@ _TILE = 16
 """Side of a tile, px: `kTileSize` of `xrgs/csrc/raster/types.h`."""
 _CULLING = [field.name for field in fields(CullingOptions)]
 """Names of the culling options, in the order of `RenderConfig`'s argument."""
+_ALL_CULLING = CullingOptions()
 _FIRST_PARAMETER = 2
 """Index of the first parameter among the arguments of `_Rasterize.forward`."""
 _SHN_INPUT = _FIRST_PARAMETER + PARAMETERS.index("shN")
@@ -40,12 +41,15 @@ def render(
     means2d_offset: Tensor | None,
     *,
     raw: bool = False,
+    culling: CullingOptions = _ALL_CULLING,
 ) -> Render:
     """Render Gaussians into one view as `xrgs.splat.rendering.rasterize_parameters` does.
 
     The number of threads is torch's (`torch.set_num_threads`). The result has the same bits for any
-    number of threads. With `raw`, image and gradients have the bits of `activate` and then
-    `render`, and one pass over memory is saved forward and one backward.
+    number of threads. With `raw`, image and gradients have the bits of `exp`, `logistic` and then
+    `render`, and one pass over memory is saved forward and one backward. With some kinds of
+    `culling` off, to measure what they save, the image is the same; Gaussians that `out_of_view` or
+    `sub_threshold` would have culled count as visible.
 
     The backward pass raises ValueError if a needed gradient is not finite. The message names the
     parameter, or the incoming gradient `v_image` or `v_alpha` if that one is not finite.
@@ -54,26 +58,6 @@ def render(
         ValueError: As for `rasterize_parameters`, or float32 cannot hold a number of the camera or
             the settings. Harmonics are only checked for visible Gaussians.
         MemoryError: The tile lists of the view do not fit in memory.
-    """
-    return render_culled(
-        gaussians, camera, settings, sh_degree, means2d_offset, CullingOptions(), raw=raw
-    )
-
-
-def render_culled(
-    gaussians: ActivatedGaussians,
-    camera: Camera,
-    settings: RasterSettings,
-    sh_degree: int,
-    means2d_offset: Tensor | None,
-    culling: CullingOptions,
-    *,
-    raw: bool = False,
-) -> Render:
-    """Render as `render` does, with some kinds of culling off, to measure what culling saves.
-
-    The image is the same. Without `out_of_view` or `sub_threshold`, Gaussians that would have been
-    culled count as visible.
     """
     require_float32("means", gaussians.means)
     frame = _native.Frame()
@@ -117,10 +101,6 @@ def render_config(
     )
 
 
-def _contiguous(tensor: Tensor | None) -> Tensor | None:
-    return None if tensor is None else tensor.detach().contiguous()
-
-
 def _handles(tensors: Sequence[Tensor | None]) -> list[Any]:
     return [None if tensor is None else handle(tensor) for tensor in tensors]
 
@@ -134,7 +114,7 @@ class _Rasterize(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor]:
         if is_zero_offset(inputs[-1]):  # its gradient needs no pass over zeros
             inputs = (*inputs[:-1], None)
-        contiguous = [_contiguous(tensor) for tensor in inputs]
+        contiguous = [None if each is None else each.detach().contiguous() for each in inputs]
         ctx.frame = frame
         ctx.save_for_backward(*contiguous)
         image, alpha = frame.forward(view, *_handles(contiguous), torch.get_num_threads())

@@ -11,8 +11,8 @@ from scipy.special import ive
 from torch import Tensor
 
 from xrgs import _native
-from xrgs.splat.bicubic import bicubic_matrix
 from xrgs.splat.native.arguments import require_float32
+from xrgs.splat.resample import bicubic_matrix
 
 
 class BandedMatrix(NamedTuple):

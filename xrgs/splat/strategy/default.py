@@ -21,9 +21,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from xrgs.splat.backend import implementation
 from xrgs.splat.gaussians import PARAMETERS
-from xrgs.splat.strategy.base import NO_HOOKS, Strategy
+from xrgs.splat.strategy.base import NO_HOOKS, Refinement, Strategy, StrategyHooks, Thresholds
 from xrgs.splat.strategy.ops import (
     Budget,
     gaussians_of,
@@ -31,7 +30,6 @@ from xrgs.splat.strategy.ops import (
     split_at_random,
     top_k,
 )
-from xrgs.splat.strategy.refinement import Refinement, StrategyHooks, Thresholds
 
 _OPAQUE = 1 - 2**-24
 """The largest opacity whose logit is finite in float32."""
@@ -99,6 +97,7 @@ class DefaultStrategy(Strategy):
         self.visible_count: Tensor
         self._clear_statistics()
 
+    @torch.no_grad()
     def after_step(
         self,
         step: int,
@@ -116,7 +115,10 @@ class DefaultStrategy(Strategy):
             return Refinement()
         if means2d_grad is not None:
             row = self.group_rows[group] if self.group_rows else 0
-            self._accumulate(row, means2d_grad, visible, width, height)
+            # Normalised device units, as in gsplat: every image is 2 wide and 2 high.
+            half_size = width / 2, height / 2
+            sums = self.grad2d_sum[row], self.visible_count[row]
+            self._elementwise.accumulate_statistics(means2d_grad, visible, half_size, *sums)
         refinement = Refinement()
         if step > settings.start and step % settings.every == 0:
             refinement = self._refine(step, self._deciding_thresholds(group), hooks)
@@ -163,7 +165,6 @@ class DefaultStrategy(Strategy):
             return {group: self.group_thresholds[group]}
         return {group: self.shared_thresholds}
 
-    @torch.no_grad()
     def _refine(
         self, step: int, deciding: Mapping[str, Thresholds], hooks: StrategyHooks
     ) -> Refinement:
@@ -218,16 +219,6 @@ class DefaultStrategy(Strategy):
             scores = self.grad2d_sum.sum(dim=0) / self.visible_count.sum(dim=0).clamp_min(1)
         return top_k(candidates, scores, room)
 
-    @torch.no_grad()
-    def _accumulate(
-        self, row: int, means2d_grad: Tensor, visible: Tensor, width: int, height: int
-    ) -> None:
-        # Normalised device units, as in gsplat: every image is 2 wide and 2 high.
-        half_size = width / 2, height / 2
-        accumulate = implementation("densify", self.optimizer.backend).accumulate_statistics
-        sums = self.grad2d_sum[row], self.visible_count[row]
-        accumulate(means2d_grad, visible, half_size, *sums)
-
     def _clear_statistics(self) -> None:
         count = len(self.group_thresholds) if self.per_group else 1
         self.grad2d_sum = self.gaussians.opacities.new_zeros(count, len(self.gaussians))
@@ -252,7 +243,13 @@ class DefaultStrategy(Strategy):
             )
         duplicate = growing & ~split
         copies = {name: self.gaussians[name][duplicate] for name in PARAMETERS}
-        halves = self._halves({name: self.gaussians[name][split] for name in PARAMETERS})
+        old = {name: self.gaussians[name][split] for name in PARAMETERS}
+        scales = self._elementwise.exp(old["scales"])  # [M, 3]
+        halves = (
+            split_along_longest_axis(old, scales)
+            if self.settings.split == "long_axis"
+            else split_at_random(old, scales, self.generator)
+        )
         self._keep(~split)
         self.optimizer.append(
             {name: torch.cat([copies[name], halves[name]]) for name in PARAMETERS}
@@ -260,13 +257,6 @@ class DefaultStrategy(Strategy):
         index = torch.arange(len(growing), device=growing.device)
         parents = torch.cat([index[~split], index[duplicate], index[split].repeat(2)])
         return {"duplicated": int(duplicate.sum()), "split": int(split.sum())}, parents
-
-    def _halves(self, old: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Split Gaussians in two: name -> raw parameters [2 M, ...] of the halves."""
-        scales = self._activations.exp(old["scales"])  # [M, 3]
-        if self.settings.split == "long_axis":
-            return split_along_longest_axis(old, scales)
-        return split_at_random(old, scales, self.generator)
 
     def _prune(
         self, thresholds: Tensor, deciding_row: Tensor, *, prune_large: bool
@@ -277,7 +267,7 @@ class DefaultStrategy(Strategy):
             The counts, and the number of Gaussians that each of the G thresholds removed.
         """
         low_opacity = (
-            self._activations.logistic(self.gaussians.opacities) < thresholds[deciding_row]
+            self._elementwise.logistic(self.gaussians.opacities) < thresholds[deciding_row]
         )  # [N]
         largest = self.settings.prune_scale3d * self.scene_scale if prune_large else math.inf
         too_large = ~low_opacity & (self._largest_scale() > largest)
@@ -289,7 +279,6 @@ class DefaultStrategy(Strategy):
         by_row = torch.bincount(deciding_row[low_opacity], minlength=len(thresholds))
         return counts, by_row.tolist()
 
-    @torch.no_grad()
     def _reset_opacities(self, hooks: StrategyHooks) -> int:
         """Cap the opacities and set their moments to zero; return how many were above the cap."""
         # The cap must be above every group's threshold, or the next refinement would prune.

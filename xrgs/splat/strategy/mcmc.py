@@ -16,9 +16,8 @@ from torch import Tensor
 
 from xrgs.splat.gaussians import PARAMETERS
 from xrgs.splat.quaternions import rotate
-from xrgs.splat.strategy.base import NO_HOOKS, Strategy
+from xrgs.splat.strategy.base import NO_HOOKS, Refinement, Strategy, StrategyHooks
 from xrgs.splat.strategy.ops import gaussians_of
-from xrgs.splat.strategy.refinement import Refinement, StrategyHooks
 
 GROWTH = 1.05
 """Factor by which a refinement raises the number of Gaussians."""
@@ -174,7 +173,7 @@ class MCMCStrategy(Strategy):
         size = self.settings.noise * self.optimizer.rates["means"]
         if not size:
             return
-        gaussians, activations = self.gaussians, self._activations
+        gaussians, activations = self.gaussians, self._elementwise
         exponents = _NOISE_STEEPNESS * ((1 - self._opacities()) - _NOISE_OPACITY)
         shares = activations.logistic(exponents)  # [N]
         moving = (shares > _LEAST_NOISE).nonzero()[:, 0]  # [M]
@@ -187,7 +186,7 @@ class MCMCStrategy(Strategy):
 
     def _opacities(self) -> Tensor:
         """Return the opacity [N] of each Gaussian."""
-        opacities: Tensor = self._activations.logistic(self.gaussians.opacities)
+        opacities: Tensor = self._elementwise.logistic(self.gaussians.opacities)
         return opacities
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from xrgs.splat.ssim import C1, C2, WINDOW, Target, window_mean, window_moments
+from xrgs.splat.loss import C1, C2, WINDOW, Target, window_mean, window_moments
 
 #: Rows of windows that `target_moments` computes at once. At 1,008 px these fit in the processor's
 #: cache, which takes a tenth of the time of all rows at once.

@@ -21,7 +21,7 @@ from xrgs.splat.gaussians import ActivatedGaussians
 from xrgs.splat.rendering import Render
 from xrgs.splat.settings import RasterSettings
 from xrgs.splat.sh import sh_to_colors
-from xrgs.splat.torch.activations import activated
+from xrgs.splat.torch.elementwise import activated
 from xrgs.splat.torch.projection import (
     ProjectedGaussians,
     conic_cholesky,

@@ -8,7 +8,7 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from xrgs.splat.bicubic import bicubic_matrix
+from xrgs.splat.resample import bicubic_matrix
 
 
 def resize(image: Tensor, height: int, width: int, variances: Tensor | None = None) -> Tensor:

@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from xrgs.splat.cameras import Camera
     from xrgs.splat.gaussians import ActivatedGaussians, Gaussians
     from xrgs.splat.settings import DensifySettings
-    from xrgs.splat.strategy.refinement import Groups
+    from xrgs.splat.strategy.base import Groups
     from xrgs.training.dataset import Dataset
 
 TrainingView = LoadedView

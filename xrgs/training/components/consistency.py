@@ -12,20 +12,12 @@ from torch import Tensor
 from xrgs.errors import XrgsError
 from xrgs.splat.loss import WINDOW, Target, photometric_loss, prepare_target
 from xrgs.splat.resample import resize
-from xrgs.training.components.base import (
-    Component,
-    Step,
-    TrainingSetup,
-    TrainingView,
-    check_not_negative,
-)
+from xrgs.training.components.base import Component, Step, TrainingSetup, TrainingView
 from xrgs.training.memory import OnDemand
 
 if TYPE_CHECKING:
     from xrgs.config import ConsistencyConf
     from xrgs.splat.gaussians import Gaussians
-
-_LR_MODES = ("exact", "fold", "off")
 
 
 class Consistency(Component):
@@ -72,10 +64,6 @@ class Consistency(Component):
         factor: int,
         backend: str = "torch",
     ) -> None:
-        if settings.lr_mode not in _LR_MODES:
-            raise XrgsError(
-                f"components.consistency.lr_mode={settings.lr_mode}: must be exact, fold or off"
-            )
         self.weight, self.l1, self.ssim = settings.weight, settings.l1, settings.ssim
         self.lr_mode, self.backend = settings.lr_mode, backend
         hr_sides = (
@@ -87,41 +75,28 @@ class Consistency(Component):
         self.paired_targets = OnDemand(self._paired_target, paired)
 
     @classmethod
-    def from_settings(cls, settings: ConsistencyConf, setup: TrainingSetup) -> Self | None:
-        """Build the component; a `weight` of 0 leaves it off.
-
-        Raises:
-            XrgsError: A setting is out of range, `lr_mode` is unknown, or a paired image is smaller
-                than the SSIM window.
-        """
-        for name in ("weight", "l1", "ssim"):
-            check_not_negative(f"components.consistency.{name}", getattr(settings, name))
-        if settings.weight == 0:
-            return None
+    def from_settings(cls, settings: ConsistencyConf, setup: TrainingSetup) -> Self:
+        """Build the component; XrgsError if a paired image is smaller than the SSIM window."""
         return cls(settings, setup.data.train, setup.data.factor, setup.backend)
 
     def modify_loss(self, loss: Tensor, image: Tensor, gaussians: Gaussians, step: Step) -> Tensor:
         """Return `loss + L_cons`, and record L_cons as `consistency.<tag>`."""
-        consistency = self._consistency_loss(image, step.view)
-        if consistency is None:
-            return loss
-        step.log[f"consistency.{step.view.tag}"] = consistency.item()
-        return loss + consistency
-
-    def _consistency_loss(self, image: Tensor, view: TrainingView) -> Tensor | None:
-        """Return L_cons of a render [H, W, 3], a scalar; None if the view has no such term."""
+        view = step.view
         if view.tag == "HR" or self.lr_mode == "exact":
             target = self.paired_targets[view.name]
             height, width = target.image.shape[:2]
             projected = resize(image, height, width, backend=self.backend)
             # Multiplying the result by the weight would be one more pass over the image.
             l1, ssim = self.weight * self.l1, self.weight * self.ssim
-            return photometric_loss(projected, target, l1=l1, ssim=ssim, backend=self.backend)
-        if self.lr_mode == "fold":
+            added = photometric_loss(projected, target, l1=l1, ssim=ssim, backend=self.backend)
+        elif self.lr_mode == "fold":
             # In double, where only digits below float32's precision depend on the thread count.
             difference = (image - view.image).abs().mean(dtype=torch.float64)
-            return self.weight * self.l1 * difference.to(image)
-        return None
+            added = self.weight * self.l1 * difference.to(image)
+        else:
+            return loss
+        step.log[f"consistency.{view.tag}"] = added.item()
+        return loss + added
 
     def _paired_target(self, view: TrainingView) -> Target:
         """Resample the photograph of a view to the opposite resolution."""

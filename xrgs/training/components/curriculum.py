@@ -6,13 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Self
 
 from xrgs.errors import XrgsError
-from xrgs.training.components.base import (
-    Component,
-    Step,
-    TrainingSetup,
-    TrainingView,
-    check_not_negative,
-)
+from xrgs.training.components.base import Component, Step, TrainingSetup, TrainingView
 
 if TYPE_CHECKING:
     from xrgs.config import CurriculumConf
@@ -42,10 +36,9 @@ class Curriculum(Component):
         self.lr_only = settings.lr_only
 
     @classmethod
-    def from_settings(cls, settings: CurriculumConf, setup: TrainingSetup) -> Self | None:
-        """Build the component; an `lr_only` of 0 leaves it off."""
-        check_not_negative("components.curriculum.lr_only", settings.lr_only)
-        return cls(settings, setup.data.train) if settings.lr_only else None
+    def from_settings(cls, settings: CurriculumConf, setup: TrainingSetup) -> Self:
+        """Build the component."""
+        return cls(settings, setup.data.train)
 
     def allows_view(self, step: Step) -> bool:
         """Allow LR views always, and HR views after the warm-up."""

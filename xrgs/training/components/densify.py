@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Self
 
 from xrgs.errors import XrgsError
-from xrgs.splat.strategy.refinement import DECIDE, Groups, Thresholds
-from xrgs.training.components.base import Component, TrainingSetup, check_not_negative
+from xrgs.splat.strategy.base import Groups, Thresholds
+from xrgs.training.components.base import Component, TrainingSetup
 
 if TYPE_CHECKING:
     from xrgs.config import DensifyConf
@@ -45,21 +45,14 @@ class Densify(Component):
     """
 
     def __init__(self, settings: DensifyConf) -> None:
-        if settings.decide not in DECIDE:
-            raise XrgsError(
-                f"components.densify.decide={settings.decide}: must be one of shared,"
-                f" {', '.join(DECIDE)}"
-            )
         self.settings = settings
 
     @classmethod
-    def from_settings(cls, settings: DensifyConf, setup: TrainingSetup) -> Self | None:
-        """Build the component; `decide: shared` leaves it off."""
-        check_not_negative("components.densify.lr_grow", settings.lr_grow)
-        check_not_negative("components.densify.lr_prune", settings.lr_prune)
+    def from_settings(cls, settings: DensifyConf, setup: TrainingSetup) -> Self:
+        """Build the component."""
         if settings.decide == "own_threshold" and settings.lr_grow == 0:
             raise XrgsError("components.densify.lr_grow=0.0: must be above 0 with own_threshold")
-        return None if settings.decide == "shared" else cls(settings)
+        return cls(settings)
 
     def densification_groups(self, settings: DensifySettings) -> Groups:
         """Return the thresholds of HR and LR views; HR is first and has precedence (`Groups`)."""

@@ -9,15 +9,8 @@ from typing import TYPE_CHECKING, Any, Self
 import torch
 from torch import Tensor
 
-from xrgs.errors import XrgsError
 from xrgs.training.components.adam import RowAdam
-from xrgs.training.components.base import (
-    Component,
-    Step,
-    TrainingSetup,
-    TrainingView,
-    check_not_negative,
-)
+from xrgs.training.components.base import Component, Step, TrainingSetup, TrainingView
 
 if TYPE_CHECKING:
     from xrgs.config import ExposureConf
@@ -72,17 +65,8 @@ class Exposure(Component):
         """Map of the step's view [3, 4], on which the gradient accumulates."""
 
     @classmethod
-    def from_settings(cls, settings: ExposureConf, setup: TrainingSetup) -> Self | None:
-        """Build the component; the mode `none` leaves it off."""
-        key = "components.exposure"
-        if settings.mode not in ("none", "affine", "gain"):
-            raise XrgsError(f"{key}.mode={settings.mode}: must be none, affine or gain")
-        if settings.mode == "none":
-            return None
-        for name in ("lr", "prior"):
-            check_not_negative(f"{key}.{name}", getattr(settings, name))
-        if not 0 < settings.lr_final <= 1:
-            raise XrgsError(f"{key}.lr_final={settings.lr_final}: must be in (0, 1]")
+    def from_settings(cls, settings: ExposureConf, setup: TrainingSetup) -> Self:
+        """Build the component."""
         return cls(settings, setup.data.train)
 
     def map_of(self, name: str) -> Tensor:

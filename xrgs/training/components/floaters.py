@@ -8,13 +8,7 @@ from typing import TYPE_CHECKING, Any, Self
 import torch
 from torch import Tensor
 
-from xrgs.training.components.base import (
-    Component,
-    Step,
-    TrainingSetup,
-    TrainingView,
-    check_not_negative,
-)
+from xrgs.training.components.base import Component, Step, TrainingSetup, TrainingView
 
 if TYPE_CHECKING:
     from xrgs.config import FloatersConf
@@ -64,11 +58,8 @@ class Floaters(Component):
         """Number of Gaussians that this component has removed."""
 
     @classmethod
-    def from_settings(cls, settings: FloatersConf, setup: TrainingSetup) -> Self | None:
-        """Build the component; a `near_share` of 0 leaves it off."""
-        check_not_negative("components.floaters.near_share", settings.near_share)
-        if settings.near_share == 0:
-            return None
+    def from_settings(cls, settings: FloatersConf, setup: TrainingSetup) -> Self:
+        """Build the component."""
         return cls(settings, setup.data.train, setup.data.points, setup.splat.densify)
 
     def to_prune(self, gaussians: Gaussians, step: Step) -> Tensor | None:

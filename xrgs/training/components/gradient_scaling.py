@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Self
 
 from xrgs.splat.rounding import rounded_norm
-from xrgs.training.components.base import Component, Step, TrainingSetup, check_not_negative
+from xrgs.training.components.base import Component, Step, TrainingSetup
 
 if TYPE_CHECKING:
     from xrgs.config import GradientScalingConf
@@ -29,10 +29,9 @@ class GradientScaling(Component):
         self.lr_scale = settings.lr_scale
 
     @classmethod
-    def from_settings(cls, settings: GradientScalingConf, setup: TrainingSetup) -> Self | None:
-        """Build the component; an `lr_scale` of 1 leaves it off."""
-        check_not_negative("components.gradient_scaling.lr_scale", settings.lr_scale)
-        return None if settings.lr_scale == 1 else cls(settings)
+    def from_settings(cls, settings: GradientScalingConf, setup: TrainingSetup) -> Self:
+        """Build the component."""
+        return cls(settings)
 
     def after_backward(self, gaussians: Gaussians, step: Step) -> None:
         """Multiply the gradient of the log scales by `lr_scale` in an LR view.

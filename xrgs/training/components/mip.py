@@ -9,15 +9,8 @@ from typing import TYPE_CHECKING, Any, Self
 import torch
 from torch import Tensor
 
-from xrgs.errors import XrgsError
 from xrgs.splat.rounding import rounded_mean, rounded_sqrt
-from xrgs.training.components.base import (
-    Component,
-    Step,
-    TrainingSetup,
-    TrainingView,
-    check_not_negative,
-)
+from xrgs.training.components.base import Component, Step, TrainingSetup, TrainingView
 
 if TYPE_CHECKING:
     from xrgs.config import MipConf
@@ -72,13 +65,8 @@ class Mip(Component):
         self.unseen_count = 0
 
     @classmethod
-    def from_settings(cls, settings: MipConf, setup: TrainingSetup) -> Self | None:
-        """Build the component; a `variance` of 0 leaves it off."""
-        check_not_negative("components.mip.variance", settings.variance)
-        if settings.every < 1:
-            raise XrgsError(f"components.mip.every={settings.every}: must be at least 1")
-        if settings.variance == 0:
-            return None
+    def from_settings(cls, settings: MipConf, setup: TrainingSetup) -> Self:
+        """Build the component."""
         return cls(settings, setup.data.train, setup.splat.raster.near)
 
     def opacity_attenuation(self, gaussians: Gaussians) -> Tensor | None:

@@ -13,7 +13,7 @@ from xrgs.errors import XrgsError
 from xrgs.splat.rounding import rounded_mean
 from xrgs.splat.settings import NOMINAL_STEPS
 from xrgs.splat.strategy.ops import gaussians_of
-from xrgs.training.components.base import Component, Step, TrainingSetup, check_not_negative
+from xrgs.training.components.base import Component, Step, TrainingSetup
 
 if TYPE_CHECKING:
     from xrgs.config import NaturalSelectionConf
@@ -82,16 +82,11 @@ class NaturalSelection(Component):
         """Build the component; a `budget` of 0 leaves it off.
 
         Raises:
-            XrgsError: The budget is below 0, `drop_every` below 1, or `until` is before the end of
-                densification plus 1,000 steps, or after the run.
+            XrgsError: `until` is before the end of densification plus 1,000 steps, or after the
+                run.
         """
-        check_not_negative("components.natural_selection.budget", settings.budget)
         if settings.budget == 0:
             return None
-        if settings.drop_every < 1:
-            raise XrgsError(
-                f"components.natural_selection.drop_every={settings.drop_every}: must be at least 1"
-            )
         stop = setup.splat.densify.stop
         if not stop + _LEAD < settings.until <= NOMINAL_STEPS:
             raise XrgsError(

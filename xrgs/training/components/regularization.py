@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Self
 import torch
 from torch import Tensor
 
-from xrgs.training.components.base import Component, Step, TrainingSetup, check_not_negative
+from xrgs.training.components.base import Component, Step, TrainingSetup
 
 if TYPE_CHECKING:
     from xrgs.config import RegularizationConf
@@ -31,11 +31,9 @@ class Regularization(Component):
         self.settings, self.backend = settings, backend
 
     @classmethod
-    def from_settings(cls, settings: RegularizationConf, setup: TrainingSetup) -> Self | None:
-        """Build the component; it is off if both weights are 0."""
-        for name in ("opacity", "scale"):
-            check_not_negative(f"components.regularization.{name}", getattr(settings, name))
-        return cls(settings, setup.backend) if settings.opacity or settings.scale else None
+    def from_settings(cls, settings: RegularizationConf, setup: TrainingSetup) -> Self:
+        """Build the component."""
+        return cls(settings, setup.backend)
 
     def modify_loss(self, loss: Tensor, image: Tensor, gaussians: Gaussians, step: Step) -> Tensor:
         """Add the penalties; `regularization.opacity` and `.scale` record the means."""

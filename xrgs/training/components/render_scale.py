@@ -6,13 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Self
 
 from xrgs.splat.gaussians import ActivatedGaussians
-from xrgs.training.components.base import (
-    Component,
-    Step,
-    TrainingSetup,
-    TrainingView,
-    check_not_negative,
-)
+from xrgs.training.components.base import Component, Step, TrainingSetup, TrainingView
 
 if TYPE_CHECKING:
     from xrgs.config import RenderScaleConf
@@ -46,10 +40,9 @@ class RenderScale(Component):
         }
 
     @classmethod
-    def from_settings(cls, settings: RenderScaleConf, setup: TrainingSetup) -> Self | None:
-        """Build the component; a `gamma` of 0 leaves it off."""
-        check_not_negative("components.render_scale.gamma", settings.gamma)
-        return None if settings.gamma == 0 else cls(settings, setup.data.train)
+    def from_settings(cls, settings: RenderScaleConf, setup: TrainingSetup) -> Self:
+        """Build the component."""
+        return cls(settings, setup.data.train)
 
     def before_render(self, activated: ActivatedGaussians, step: Step) -> ActivatedGaussians:
         """Multiply the scales by k in an LR view, and record k as `render_scale.k`."""

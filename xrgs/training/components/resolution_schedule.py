@@ -76,19 +76,8 @@ class ResolutionSchedule(Component):
         """Name -> HR view downsampled by the present factor; empty if the factor is 1."""
 
     @classmethod
-    def from_settings(cls, settings: ResolutionScheduleConf, setup: TrainingSetup) -> Self | None:
-        """Build the component; a `start_share` of 1 leaves it off.
-
-        Raises:
-            XrgsError: A setting is out of its range, or there is no HR view.
-        """
-        key = "components.resolution_schedule"
-        if not 0 < settings.start_share <= 1:
-            raise XrgsError(f"{key}.start_share={settings.start_share}: must be in (0, 1]")
-        if settings.start_share == 1:
-            return None
-        if settings.until < 1:
-            raise XrgsError(f"{key}.until={settings.until}: must be at least 1")
+    def from_settings(cls, settings: ResolutionScheduleConf, setup: TrainingSetup) -> Self:
+        """Build the component; XrgsError if there is no HR view."""
         return cls(settings, setup.data.train, setup.backend)
 
     def training_views(

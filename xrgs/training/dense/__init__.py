@@ -6,11 +6,11 @@ multi-view stereo with the variant's poses:
 
 1. A plane sweep [collins1996] compares every view with its nearest neighbours, at planes between
    the depths of its SfM points, evenly spaced in inverse depth (`depths`, `matching`).
-2. Semi-global matching [hirschmuller2008] smooths the costs (`semiglobal`).
-3. A depth is kept if neighbours have it too, and more views confirm than contradict it (`checks`).
+2. Semi-global matching [hirschmuller2008] smooths the costs (`matching`).
+3. A depth is kept if neighbours have it too, and more views confirm than contradict it (`depths`).
 4. Each place of the scene is assigned to the view that samples it most finely.
 5. A quadtree over the pixels assigned to each view is split where colours differ, until the number
-   of leaves reaches the budget; each leaf becomes a Gaussian (`quadtree`, `surface`).
+   of leaves reaches the budget; each leaf becomes a Gaussian (`surface`).
 
 The Gaussians on the SfM points are kept. A dense start would harm if few depths are consistent or
 large parts of the views are not covered: then training starts from the SfM points, with a warning.

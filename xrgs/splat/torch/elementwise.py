@@ -1,9 +1,26 @@
-"""The densification statistics of a step in plain torch."""
+"""The activation functions and the densification statistics in plain torch."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
+
+from xrgs.splat.gaussians import ActivatedGaussians
+
+
+def exp(x: Tensor) -> Tensor:
+    """Return e^x: scales from their natural logarithms."""
+    return torch.exp(x)
+
+
+def logistic(x: Tensor) -> Tensor:
+    """Return 1 / (1 + e^-x): opacities from their logits."""
+    return torch.sigmoid(x)
+
+
+def activated(raw: ActivatedGaussians) -> ActivatedGaussians:
+    """Apply the activation functions to raw Gaussians (log scales, logit opacities)."""
+    return raw._replace(scales=exp(raw.scales), opacities=logistic(raw.opacities))
 
 
 def accumulate_statistics(

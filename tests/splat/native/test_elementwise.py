@@ -1,4 +1,4 @@
-"""The compiled activation functions against numpy and torch in double."""
+"""The compiled activations against numpy and torch in double, and the densification statistics."""
 
 from __future__ import annotations
 
@@ -9,16 +9,18 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
-from tests.splat.scenes import normal_parameters
+from tests.splat.scenes import make_strategy, normal_parameters
+from xrgs.splat.strategy.default import DefaultStrategy
 
 native = pytest.importorskip("xrgs._native")
-activations = importlib.import_module("xrgs.splat.native.activations")
+elementwise = importlib.import_module("xrgs.splat.native.elementwise")
 
 SMALLEST = 2.0**-126
 """The smallest normal float32 number."""
 LARGEST = float(np.finfo(np.float32).max)
-FUNCTIONS = {"exp": activations.exp, "logistic": activations.logistic}
+FUNCTIONS = {"exp": elementwise.exp, "logistic": elementwise.logistic}
 EXACT: dict[str, Callable[[NDArray[np.float64]], NDArray[np.float64]]] = {
     "exp": np.exp,
     "logistic": lambda x: np.exp(np.minimum(x, 0)) / (1 + np.exp(-np.abs(x))),
@@ -80,24 +82,51 @@ def test_gradients_are_those_in_double(name: str, count: int) -> None:
 def test_other_strides_are_taken_and_other_types_and_lengths_refused(name: str) -> None:
     x = torch.linspace(-3, 3, 30).view(5, 6)
     assert torch.equal(FUNCTIONS[name](x.T), FUNCTIONS[name](x).T)
-    with pytest.raises(ValueError, match="x must be float32 on the CPU"):
+    with pytest.raises(ValueError, match=r"(scales|opacities) must be float32 on the CPU"):
         FUNCTIONS[name](x.double())
     with pytest.raises(ValueError, match="shapes that do not fit"):
         getattr(native, f"{name}_backward")(torch.zeros(3), torch.zeros(4), 1)
 
 
-def test_activate_is_both_functions_and_gives_no_gradient_that_there_is_none_of() -> None:
-    x = normal_parameters(37, 0)
-    scales, opacities = (x[name].requires_grad_() for name in ("scales", "opacities"))
-    both = activations.activate(scales, opacities)
-    alone = activations.exp(scales), activations.logistic(opacities)
-    for of_both, of_one, leaf in zip(both, alone, (scales, opacities), strict=True):
-        assert torch.equal(of_both, of_one)
-        seed = torch.randn(of_one.shape, generator=torch.Generator().manual_seed(1))
-        gradients = torch.autograd.grad(
-            of_both, (scales, opacities), seed, retain_graph=True, allow_unused=True
-        )
-        (expected,) = torch.autograd.grad(of_one, leaf, seed)
-        found = [gradient for gradient in gradients if gradient is not None]
-        assert len(found) == 1
-        assert torch.equal(found[0], expected)
+native = pytest.importorskip("xrgs._native")
+
+
+def step(count: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """Image-plane gradients [N, 2] and visibility [N]."""
+    generator = torch.Generator().manual_seed(seed)
+    gradient = 1e-4 * torch.randn(count, 2, generator=generator)
+    return gradient, torch.rand(count, generator=generator) < 0.6
+
+
+def strategy(count: int, backend: str, dtype: torch.dtype = torch.float32) -> DefaultStrategy:
+    return make_strategy(normal_parameters(count, 1, dtype=dtype), backend=backend)
+
+
+@pytest.mark.parametrize("count", [0, 1, 16, 31, 40_000])
+def test_sums_are_those_in_double(isa: str, count: int) -> None:
+    ours, exact = strategy(count, "native"), strategy(count, "torch", torch.float64)
+    for number in range(3):
+        gradient, visible = step(count, number)
+        width = 100 + number
+        ours.after_step(number, gradient, visible, width=width, height=75)
+        exact.after_step(number, gradient.double(), visible, width=width, height=75)
+    assert torch.equal(ours.visible_count.double(), exact.visible_count)
+    torch.testing.assert_close(ours.grad2d_sum.double(), exact.grad2d_sum, rtol=4e-7, atol=0)
+
+
+def test_what_is_not_visible_adds_nothing(backend: str) -> None:
+    gradient, visible = step(50)
+    gradient[~visible] = torch.nan
+    ours = strategy(50, backend)
+    ours.after_step(1, gradient, visible, width=9, height=9)
+    assert ours.grad2d_sum.isfinite().all()
+    assert not ours.grad2d_sum[:, ~visible].any()
+    assert torch.equal(ours.visible_count[0], visible.float())
+
+
+def test_shapes_that_do_not_fit_are_refused() -> None:
+    good = [*step(20), torch.zeros(20), torch.zeros(20)]
+    for place in range(4):
+        slope, visible, total, seen = (t[: 19 if i == place else 20] for i, t in enumerate(good))
+        with pytest.raises(ValueError, match="shapes that do not fit"):
+            native.accumulate_grad2d(slope, visible, 1.0, 1.0, total, seen, 1)
