@@ -208,6 +208,7 @@ def test_a_launcher_named_in_an_ablation_is_refused(sweep_here: SweepHere, tmp_p
         (["scene=folder", "scene.path=one"], ["one"]),
         (["store=in-the-way"], ["in-the-way", "store="]),
         (["rerun=gone"], ["rerun=gone", "no such folder"]),
+        (["rerun=~/gone"], [f"rerun={Path.home() / 'gone'}: no such folder"]),
         (["rerun=gone", "seed=1"], ["seed", "rerun= takes out="]),
         (["rerun=gone", "threads=x"], ["threads"]),
     ],

@@ -72,7 +72,7 @@ def test_gc_says_what_it_removes_and_removes_that_alone(store: Store) -> None:
     plan = gc(store)
     text = str(plan)
     assert "cells of old code (1), failed cells (1), failed scenes (1)" in text
-    assert "done, and in reports of 1 sweep: 1 cell" in text
+    assert "reports of 1 sweep lose the numbers of 1 done cell" in text
     assert "left alone, new and without a cell: 1 variant" in text
     assert names(store) == before
     freed, left = carry_out(store, plan)

@@ -114,7 +114,7 @@ def _variant(words: Sequence[str]) -> Path:
     if path.exists() and not (path / IDENTITY).is_file():
         words = last_of_each_key([*as_they_are(first), *others])
     elif "=" not in first:
-        store = Store(next((w[6:] for w in others if w.startswith("store=")), STORE))
+        store = Store(next((user_path(w[6:]) for w in others if w.startswith("store=")), STORE))
         if not path.exists() and not store.exists:
             raise XrgsError(f"{first}: there is no such folder, and no store {store.path}")
         folder = store.find_folder(first)
