@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import subprocess
 import sys
@@ -12,10 +13,12 @@ from dataclasses import MISSING, Field, asdict, fields, is_dataclass, replace
 from functools import reduce
 from operator import getitem
 from pathlib import Path
-from typing import Any, get_type_hints
+from types import SimpleNamespace
+from typing import Any, cast, get_type_hints
 
 import hydra
 import pytest
+import torch
 import yaml
 from hydra import version
 from hydra.core.singleton import Singleton
@@ -28,7 +31,14 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 import xrgs
-from xrgs.composing import error_line, escape_interpolations, from_dict, from_file
+from xrgs.composing import (
+    COMPONENT_TEXTS,
+    error_line,
+    escape_interpolations,
+    from_dict,
+    from_file,
+    to_conf,
+)
 from xrgs.config import (
     CONF_DIR,
     PATHS,
@@ -37,6 +47,7 @@ from xrgs.config import (
 )
 from xrgs.errors import XrgsError
 from xrgs.splat.settings import DensifySettings, OptimizerSettings, RasterSettings
+from xrgs.training.components import build
 
 Compose = Callable[..., Conf]
 
@@ -234,6 +245,38 @@ def test_a_setting_that_the_strategy_does_not_read_is_refused(
 ) -> None:
     with pytest.raises(XrgsError, match=f"^{re.escape(key)}: must be "):
         compose(*overrides)
+
+
+def test_a_value_that_no_component_takes_is_refused_before_training(compose: Compose) -> None:
+    values = asdict(compose())
+
+    def checked(group: str, name: str, value: object) -> Conf:
+        changed = {group: values["components"][group] | {name: value}}
+        return to_conf(OmegaConf.create(values | {"components": values["components"] | changed}))
+
+    for group, of in values["components"].items():
+        for name, value in of.items() if group != "plugins" else ():
+            key = f"components.{group}.{name}"
+            wrong = {str: ("other",), int: (-1,), float: (-0.1, math.nan, math.inf)}
+            for other in wrong[type(value)]:
+                with pytest.raises(XrgsError, match=f"^{key}=.*: must be "):
+                    checked(group, name, other)
+            for text in COMPONENT_TEXTS.get(key, ()):
+                checked(group, name, text)
+
+
+def test_a_plan_and_a_component_accept_the_same_texts(compose: Compose) -> None:
+    """A component that is on refuses an unknown text, and lists those that it takes."""
+    view = SimpleNamespace(name="a", tag="LR", image=torch.ones(16, 16, 3), sampling_rate=1.0)
+    data = SimpleNamespace(train=[view], test=[], factor=1)
+    for key, texts in COMPONENT_TEXTS.items():
+        _, group, name = key.split(".")
+        conf = compose(f"+ablation={group}")
+        setattr(getattr(conf.components, group), name, "other")
+        with pytest.raises(XrgsError, match=f"{key}=other: must be ") as raised:
+            build(conf.components, cast("Any", data), conf.splat)
+        listed = str(raised.value).partition("must be ")[2].removeprefix("one of ")
+        assert re.split(r", | or ", listed) == [*texts]
 
 
 def test_mcmc_takes_the_rendering_of_other_arms(compose: Compose) -> None:

@@ -11,7 +11,7 @@ import re
 import threading
 from contextlib import contextmanager
 from copy import deepcopy
-from dataclasses import is_dataclass
+from dataclasses import asdict, is_dataclass
 from functools import cache, reduce
 from operator import getitem
 from typing import TYPE_CHECKING, Any, cast
@@ -41,6 +41,14 @@ _AT = re.compile(r" - at `\$\.?(.*)`$")
 #: Placeholder in `conf/config.yaml` for a value that the files of `conf/scene/` set.
 _OPEN = "???"
 _RETRY = ("none", "failed")
+#: Key of a component whose value is a text -> the texts that the component accepts.
+COMPONENT_TEXTS = {
+    "components.loss_weighting.stat_from": ("weighted", "unweighted"),
+    "components.densify.decide": ("shared", "current_view", "per_class", "own_threshold"),
+    "components.formation.widths": ("none", "tag", "view"),
+    "components.consistency.lr_mode": ("exact", "fold", "off"),
+    "components.exposure.mode": ("none", "affine", "gain"),
+}
 _HYDRA_LOCK = threading.Lock()
 
 
@@ -114,6 +122,7 @@ def to_conf(cfg: DictConfig) -> Conf:
     _check_ranges(conf)
     _check_optimizer(conf.splat.optimizer)
     _check_choices(conf)
+    _check_components(conf)
     _check_strategy(conf)
     return conf
 
@@ -193,6 +202,22 @@ def _check_choices(conf: Conf) -> None:
     ):
         if value not in accepted:
             raise XrgsError(f"{key}={value}: must be one of {', '.join(accepted)}")
+
+
+def _check_components(conf: Conf) -> None:
+    """Raise `XrgsError` for a value that no component takes, so that a plan refuses it.
+
+    Components check their values again, with limits of their own and the views at hand. Plugins
+    check theirs only then.
+    """
+    for group, settings in asdict(conf.components).items():
+        for name, value in settings.items() if group != "plugins" else ():
+            key = f"components.{group}.{name}"
+            if isinstance(value, str):
+                if value not in (accepted := COMPONENT_TEXTS[key]):
+                    raise XrgsError(f"{key}={value}: must be one of {', '.join(accepted)}")
+            elif not (math.isfinite(value) and value >= 0):
+                raise XrgsError(f"{key}={value}: must be a finite number, 0 or more")
 
 
 def _check_strategy(conf: Conf) -> None:

@@ -79,8 +79,9 @@ def test_inspect_takes_a_folder_of_photographs_as_they_are(
     assert code == 1
     assert err == "xrgs-data: graden: there is no such folder, and no store xrgs-store"
     monkeypatch.setenv("HOME", "/home/me")
-    _, _, err = xrgs_data("inspect", "graden", "store=~/s")
-    assert err == "xrgs-data: graden: there is no such folder, and no store /home/me/s"
+    for word in ("store=~/s", "--store=~/s"):
+        _, _, err = xrgs_data("inspect", "graden", word)
+        assert err == "xrgs-data: graden: there is no such folder, and no store /home/me/s"
 
 
 @pytest.mark.slow

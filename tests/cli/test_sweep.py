@@ -237,7 +237,7 @@ def test_bad_input_is_named(
     ("arguments", "named"),
     [
         (["scene=folder", "scene.path=broken"], "broken"),
-        (["components.loss_weighting.lr_weight=-1"], "components.loss_weighting.lr_weight"),
+        (["+ablation=exposure", "components.exposure.lr_final=2"], "components.exposure.lr_final"),
     ],
     ids=" ".join,
 )

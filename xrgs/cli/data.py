@@ -85,6 +85,7 @@ def lpips(
 def inspect(
     variant: Positional[Annotated[tuple[str, ...], shown_as("FOLDER|CELL|KEY=VALUE ...")]],
     out: Annotated[Path | None, shown_as("FILE.png")] = None,
+    store: OptionalFolder = None,
 ) -> None:
     """Print a table of a variant's views and the result of SfM, and draw all views on one sheet.
 
@@ -93,12 +94,14 @@ def inspect(
             as for xrgs-sweep, such as scene=llff/fern variant.factor=4. In both cases a variant
             that the store lacks is built. Or a variant by its folder or id, or a cell of it.
         out: The file of the sheet; by default it is named after the variant.
+        store: The store, as store=FOLDER.
     """
     from xrgs.store.inspect import describe
 
     if not variant:
         raise XrgsError("inspect: give a folder of photographs, or scene=NAME and other keys")
-    say(describe(_variant(variant), out))
+    words = (*variant, f"store={store}") if store else variant
+    say(describe(_variant(words), out))
 
 
 def _variant(words: Sequence[str]) -> Path:

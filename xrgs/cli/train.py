@@ -125,6 +125,8 @@ def train(settings: Settings) -> None:
     if settings.out is not None:
         check_place(settings.out, form_of(settings.out))
     words = _words(settings)
+    if settings.recipe:  # a wrong name is found before the cameras are
+        _Words(words.given, [*words.own, *_recipe(settings.recipe)]).compose()
     if settings.minutes and settings.size is None:
         side = budget.size_for(60 * settings.minutes, _measured_unit(words.compose()))
         words.own.append(f"variant.long_side={side}")

@@ -171,7 +171,9 @@ def carry_out(store: Store, plan: Plan) -> tuple[int, list[str]]:
                 why: str | None = "it is left: a sweep is training it"
             else:
                 why = item.act()
-        except (OSError, StoreError) as error:
+        except OSError as error:
+            why = f"{error.filename}: {error.strerror}"
+        except StoreError as error:
             why = str(error)
         finally:
             if held:
