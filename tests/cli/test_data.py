@@ -75,6 +75,9 @@ def test_inspect_takes_a_folder_of_photographs_as_they_are(
     (conf,) = built
     assert (conf["scene"]["path"], conf["variant"]["long_side"]) == ("garden", 99)
     assert (conf["variant"]["tags"], conf["variant"]["factor"]) == ("distance", 1)
+    code, _, err = xrgs_data("inspect", *words, "--out", "sheet.jpg")
+    assert (code, len(built)) == (1, 1)
+    assert err == "xrgs-data: --out sheet.jpg: the sheet is a PNG; name a file FILE.png"
     code, _, err = xrgs_data("inspect", "graden")
     assert code == 1
     assert err == "xrgs-data: graden: there is no such folder, and no store xrgs-store"

@@ -100,6 +100,8 @@ def inspect(
 
     if not variant:
         raise XrgsError("inspect: give a folder of photographs, or scene=NAME and other keys")
+    if out is not None and out.suffix.lower() != ".png":  # before the cameras are looked for
+        raise XrgsError(f"out={out}: the sheet is a PNG; name a file FILE.png")
     words = (*variant, f"store={store}") if store else variant
     say(describe(_variant(words), out))
 

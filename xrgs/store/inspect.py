@@ -185,6 +185,7 @@ def describe(folder: Path, out: Path | None = None) -> str:
     sheet, notes = contact_sheet(frozen)
     file = out or Path(f"{frozen.id}.png")
     try:
+        file.parent.mkdir(parents=True, exist_ok=True)
         with atomic_writer(file) as stream:
             images.write_png(stream, sheet)
     except OSError as error:
