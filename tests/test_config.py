@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import subprocess
 import sys
@@ -29,7 +30,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 import xrgs
 from tests.conftest import composed, composed_by_hydra
-from xrgs.composing import error_line, escape_interpolations, from_dict, from_file
+from xrgs.composing import error_line, escape_interpolations, from_dict, from_file, to_conf
 from xrgs.config import (
     CONF_DIR,
     PATHS,
@@ -241,6 +242,22 @@ def test_a_setting_that_the_strategy_does_not_read_is_refused(
 ) -> None:
     with pytest.raises(XrgsError, match=f"^{re.escape(key)}: must be "):
         compose(*overrides)
+
+
+def test_a_value_that_no_component_takes_is_refused_before_training(compose: Compose) -> None:
+    values = asdict(compose())
+
+    def checked(group: str, name: str, value: object) -> Conf:
+        changed = {group: values["components"][group] | {name: value}}
+        return to_conf(OmegaConf.create(values | {"components": values["components"] | changed}))
+
+    for group, of in values["components"].items():
+        for name, value in of.items() if group != "plugins" else ():
+            key = f"components.{group}.{name}"
+            wrong = {str: ("other",), int: (-1,), float: (-0.1, math.nan, math.inf)}
+            for other in wrong[type(value)]:
+                with pytest.raises(XrgsError, match=f"^{key}=.*: must be "):
+                    checked(group, name, other)
 
 
 def test_mcmc_takes_the_rendering_of_other_arms(compose: Compose) -> None:

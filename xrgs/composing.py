@@ -136,14 +136,11 @@ def _check_integers(values: dict[str, Any], path: str = "") -> None:
 
 
 def _check_limits(group: Any, path: str = "") -> None:
-    """Raise `XrgsError` for a value outside its limits; the message names its key.
-
-    Those of components are checked when a component that is on is built.
-    """
+    """Raise `XrgsError` for a value outside its limits, on or off; the message names its key."""
     for message in outside_limits(group, path):
         raise XrgsError(message)
     for name, inner in vars(group).items():
-        if is_dataclass(inner) and name != "components":
+        if is_dataclass(inner):
             _check_limits(inner, f"{path}{name}.")
 
 

@@ -187,7 +187,7 @@ class SupersampledConf:
 
     factor: int = off(1, least=1)
     late_factor: int = off(1, least=1)
-    late_from: int
+    late_from: int = limited(least=0)
 
 
 @dataclass(kw_only=True)

@@ -12,6 +12,7 @@ import pytest
 
 from xrgs.bench import rendering, run
 from xrgs.bench.settings import Settings
+from xrgs.errors import XrgsError
 from xrgs.splat.backend import resolve_backend
 
 CallCommand = Callable[..., tuple[int, str, str]]
@@ -111,6 +112,18 @@ def test_a_file_is_timed(file: Path, tmp_path: Path) -> None:
     assert {row["load"] for row in found["steps"]} == {"load"}
     sizes = {(row["width"], row["height"]) for row in found["shortcuts"]}
     assert sizes == {(40, 30), (11, 11)}  # as an LR view, at least the window of SSIM
+
+
+def test_results_that_cant_be_written_are_refused_before_any_measurement(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setattr(run, "_measure", lambda *_: pytest.fail("it was measured"))
+    (tmp_path / "file").touch()
+    for settings in (Settings(out="~/file/o"), Settings(out="~/o", json="~/file/a.json")):
+        with pytest.raises(XrgsError, match=f"{tmp_path}/file.*: cannot be written: "):
+            run.run(settings)
+    assert (tmp_path / "o").is_dir()
 
 
 @pytest.mark.parametrize(

@@ -64,6 +64,7 @@ def test_inspect_takes_a_folder_of_photographs_as_they_are(
     xrgs_data: XrgsData,
     photographs: Callable[..., Path],
     tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
     built: list[dict[str, Any]],
 ) -> None:
     photographs(tmp_path / "garden", 4)
@@ -74,9 +75,16 @@ def test_inspect_takes_a_folder_of_photographs_as_they_are(
     (conf,) = built
     assert (conf["scene"]["path"], conf["variant"]["long_side"]) == ("garden", 99)
     assert (conf["variant"]["tags"], conf["variant"]["factor"]) == ("distance", 1)
+    code, _, err = xrgs_data("inspect", *words, "--out", "sheet.jpg")
+    assert (code, len(built)) == (1, 1)
+    assert err == "xrgs-data: --out sheet.jpg: the sheet is a PNG; name a file FILE.png"
     code, _, err = xrgs_data("inspect", "graden")
     assert code == 1
     assert err == "xrgs-data: graden: there is no such folder, and no store xrgs-store"
+    monkeypatch.setenv("HOME", "/home/me")
+    for word in ("store=~/s", "--store=~/s"):
+        _, _, err = xrgs_data("inspect", "graden", word)
+        assert err == "xrgs-data: graden: there is no such folder, and no store /home/me/s"
 
 
 @pytest.mark.slow
@@ -205,7 +213,7 @@ def test_files_of_gaussians_are_converted(xrgs_data: XrgsData, tmp_path: Path) -
             code, said, err = xrgs_data("export", source, "--format", form)
             assert code == 0, err
             assert said == f"9 antialiased Gaussians: written to {made}\n"
-    for made in ("c.ply", "C.GLB", "d.spz"):  # the end of the name is the format
+    for made in ("c.ply", "C.GLB", "new/one/d.spz"):  # the end of the name is the format
         code, said, err = xrgs_data("export", "a.b.ply", "--out", made)
         assert (code, said) == (0, f"9 antialiased Gaussians: written to {made}\n"), err
         assert len(xrgs.load_gaussians(tmp_path / made).gaussians) == 9
@@ -217,7 +225,7 @@ def test_files_of_gaussians_are_converted(xrgs_data: XrgsData, tmp_path: Path) -
         (["a.b.ply", "--format", "glb", "--out", "."], "--out .: "),
         (["a.b.ply", "--out", "x.obj"], "--out x.obj: a file ends with .ply, .glb, .spz"),
         (["a.b.ply", "--out", "x.ply", "--format", "colmap"], "--out x.ply: --format colmap"),
-        (["a.b.ply", "--format", "glb", "--out", "no/x.glb"], "--out no/x.glb: No such file"),
+        (["a.b.ply", "--out", "a.b.ply/x.glb"], "--out a.b.ply/x.glb: File exists"),
         (["none.ply", "--format", "glb"], "none.ply: cannot be read"),
         (["a.b.ply"], "a.b.ply: Not a directory; give the folder"),
     ):

@@ -66,3 +66,11 @@ def test_a_sweep_that_is_not_there_is_named(call_command: RunCommand, tmp_path: 
     (tmp_path / "s" / "cells").mkdir()
     _, _, err = call_command("report", "--sweep", "nope", "--store", "s")
     assert err.startswith("xrgs-report: nope: no sweeps have such an id")
+    assert err.rstrip().endswith("none has a scene with this name; xrgs-report list has all")
+
+
+def test_a_margin_that_is_no_size_is_refused(call_command: RunCommand) -> None:
+    for words in ("--margin-psnr -0.1", "--margin-lpips nan", "--margin-psnr inf"):
+        code, _, err = call_command("report", *words.split())
+        assert code == 1
+        assert f"{words}: must be a number of at least 0" in err

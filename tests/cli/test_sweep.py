@@ -209,6 +209,7 @@ def test_a_launcher_named_in_an_ablation_is_refused(sweep_here: SweepHere, tmp_p
         (["scene=folder", "scene.path=one"], ["one"]),
         (["store=in-the-way"], ["in-the-way", "store="]),
         (["rerun=gone"], ["rerun=gone", "no such folder"]),
+        (["rerun=~/gone"], [f"rerun={Path.home() / 'gone'}: no such folder"]),
         (["rerun=gone", "seed=1"], ["seed", "rerun= takes out="]),
         (["rerun=gone", "threads=x"], ["threads"]),
     ],
@@ -237,7 +238,7 @@ def test_bad_input_is_named(
     ("arguments", "named"),
     [
         (["scene=folder", "scene.path=broken"], "broken"),
-        (["components.loss_weighting.lr_weight=-1"], "components.loss_weighting.lr_weight"),
+        (["+ablation=exposure", "components.exposure.lr_final=2"], "components.exposure.lr_final"),
     ],
     ids=" ".join,
 )

@@ -150,6 +150,12 @@ def test_more_time_gives_larger_views_and_more_steps_and_never_exceeds_the_time(
         (["garden", "--minutes", "0"], "--minutes 0: must be above 0"),
         (["garden", "--minutes", "5", "--quality", "high"], "without --quality"),
         (["garden", "--out", "a.obj"], "--out a.obj: a file ends with .ply, .glb, .spz"),
+        (["garden", "two"], "two: write KEY=VALUE, as seed=1; one folder of photographs is taken"),
+        (["garden", "--recipe", "plus,nice"], "ablation=nice: there is no such choice"),
+        (["garden", "--recipe", "nice", "--dry-run"], "ablation=nice: there is no such choice"),
+        (["garden", "--out", "garden"], "--out garden: is not empty; name a new folder"),
+        (["garden", "--out", "a_file"], "--out a_file: is a file; name a new folder"),
+        (["garden", "--out", "two.ply"], "--out two.ply: is a folder; name a file"),
         (["two"], "scene two: 2 photographs are too few: 1 is held out to test on"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
@@ -163,6 +169,8 @@ def test_what_cant_be_done_is_said_before_anything_is(
     message: str,
 ) -> None:
     photographs(tmp_path / "two", 2)
+    (tmp_path / "two.ply").mkdir()
+    (tmp_path / "a_file").touch()
     code, _, err = call_command("train", *arguments)
     assert code == 1
     assert message in err

@@ -200,6 +200,15 @@ def test_baselines_alone_have_values_and_a_failed_scene_its_reason_first(made: A
     assert "missing" not in page
 
 
+def test_the_values_of_a_baseline_are_printed_before_its_ablation_is_trained(made: Any) -> None:
+    made.add()
+    made.add("plus", state="failed")
+    made.write()
+    report = build(made.store.path, pictures=[])
+    assert " 100 s" in report.text
+    assert "How to read" not in report.text
+
+
 def test_a_sweep_of_which_everything_failed(made: Any) -> None:
     made.add_error("leaves")
     made.add_error("leaves", "consistency")

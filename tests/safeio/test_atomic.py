@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from pathlib import Path
 
@@ -28,6 +29,21 @@ def test_an_exception_leaves_the_old_content_and_no_temporary_file(tmp_path: Pat
         stream.writelines([b"half", "not bytes"])  # type: ignore[list-item]
     assert file.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [file]
+
+
+def test_an_error_of_the_disk_names_the_file(tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    for name, named in ((None, str(file)), ("another", "another")):
+        with pytest.raises(OSError, match="full") as raised, atomic_writer(file):
+            raise OSError(errno.ENOSPC, "full", name)
+        assert raised.value.filename == named
+    with pytest.raises(FileNotFoundError) as missing, atomic_writer(tmp_path / "gone" / "file"):
+        pass
+    assert missing.value.filename == str(tmp_path / "gone" / "file")
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(IsADirectoryError) as folder, atomic_writer(tmp_path / "folder"):
+        pass
+    assert str(folder.value).endswith(f"{str(tmp_path / 'folder')!r}")
 
 
 def test_others_can_read_the_file_as_the_umask_allows(tmp_path: Path) -> None:

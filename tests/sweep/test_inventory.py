@@ -102,7 +102,11 @@ def test_a_cell_is_shown_with_what_differs_from_its_baseline(store: Store, cells
     at = lines.index("differs from its baseline abc1 in:")
     assert lines[at + 1] == f"  train.steps: {cells.conf.train.steps} -> 7"
     assert "  psnr: 20 dB" in lines
+    assert not any("nan" in line for line in lines)
     assert "  scores.csv  15 B" in lines
+    (cell.path / "scores.csv").write_text("view,psnr,lpips\na,20,\nb,20,0.5\n")
+    lines = show(store, row).splitlines()
+    assert "  psnr: 20 dB" in lines
 
 
 def test_the_table_of_a_store_agrees_with_its_views(store: Store) -> None:

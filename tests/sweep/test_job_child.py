@@ -117,6 +117,7 @@ def test_the_child_answers_with_the_result_or_the_error(
     for number in (errno.ENOSPC, errno.EROFS):
         answer = in_this_process(raising(OSError(number, "no room")))
         assert answer == {"error": f"OSError: [Errno {number}] no room", "outcome": UNWRITABLE}
+    assert capsys.readouterr().err == ""  # the sweep says it in a line
     stale = in_this_process(raising(OSError(errno.ESTALE, "stale")))
     assert stale == {"error": "OSError: [Errno 116] stale"}
     other = in_this_process(raising(KeyError("k")))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+import tempfile
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
@@ -12,13 +13,14 @@ from xrgs.errors import XrgsError
 from xrgs.runtime.machine import usable_cores
 from xrgs.runtime.progress import progress
 from xrgs.safeio.atomic import atomic_writer, write_json
+from xrgs.safeio.paths import user_path
 from xrgs.safeio.records import table_text
 from xrgs.safeio.sanitize import for_csv
 from xrgs.splat.backend import resolve_backend
 from xrgs.store import provenance
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from xrgs.bench.loads import Load
     from xrgs.bench.settings import Settings
@@ -74,7 +76,8 @@ def run(settings: Settings) -> str:
         raise XrgsError("repeats must be at least 1 and threads at least 0")
     counts = sorted({1, settings.threads or usable_cores()})
     sizes = SMOKE if settings.smoke else FULL
-    load = None if settings.load is None else loads.read(Path(settings.load))
+    load = None if settings.load is None else loads.read(user_path(settings.load))
+    _check_writable(settings)  # before minutes of measurements
     if settings.against is not None:
         return _compare(settings.against, load, sizes, counts, settings)
     results = _measure(load, sizes, counts, settings)
@@ -90,8 +93,8 @@ def run(settings: Settings) -> str:
 def _save(file: str, settings: Settings) -> str:
     if settings.cell is None or settings.view is None:
         raise XrgsError("--save FILE.npz needs --cell FOLDER and --view NAME")
-    load = loads.load_from_cell(Path(settings.cell), settings.view)
-    loads.write(Path(file), load)
+    load = loads.load_from_cell(user_path(settings.cell), settings.view)
+    loads.write(user_path(file), load)
     return f"{file}: {tables.describe(load.sizes)}"
 
 
@@ -156,14 +159,34 @@ def _csv(rows: Sequence[Row]) -> bytes:
     return table_text(safe).encode()
 
 
+def _check_writable(settings: Settings) -> None:
+    """Make the folders of the results, and check that files can be written there."""
+    files = [user_path(settings.out) / "bench.csv"]
+    files += [user_path(settings.json)] if settings.json is not None else []
+    with _writing():
+        for file in files:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                tempfile.TemporaryFile(dir=file.parent).close()
+            except OSError as error:
+                error.filename = str(file)  # the name of the temporary file is random
+                raise
+
+
 def _write(files: Mapping[str, bytes], results: dict[str, Any], settings: Settings) -> None:
-    folder = Path(settings.out)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
+    folder = user_path(settings.out)
+    with _writing():
         for name, content in files.items():
             with atomic_writer(folder / name) as stream:
                 stream.write(content)
         if settings.json is not None:
-            write_json(Path(settings.json), results)
+            write_json(user_path(settings.json), results)
+
+
+@contextmanager
+def _writing() -> Iterator[None]:
+    """Turn errors of writing into an error that names the file."""
+    try:
+        yield
     except OSError as error:
         raise XrgsError(f"{error.filename}: cannot be written: {error.strerror}") from error

@@ -86,6 +86,7 @@ def lpips(
 def inspect(
     variant: Positional[Annotated[tuple[str, ...], shown_as("FOLDER|CELL|KEY=VALUE ...")]],
     out: Annotated[Path | None, shown_as("FILE.png")] = None,
+    store: OptionalFolder = None,
 ) -> None:
     """Print a table of a variant's views and the result of SfM, and draw all views on one sheet.
 
@@ -94,12 +95,16 @@ def inspect(
             as for xrgs-sweep, such as scene=llff/fern variant.factor=4. In both cases a variant
             that the store lacks is built. Or a variant by its folder or id, or a cell of it.
         out: The file of the sheet; by default it is named after the variant.
+        store: The store, as store=FOLDER.
     """
     from xrgs.store.inspect import describe
 
     if not variant:
         raise XrgsError("inspect: give a folder of photographs, or scene=NAME and other keys")
-    say(describe(_variant(variant), out))
+    if out is not None and out.suffix.lower() != ".png":  # before the cameras are looked for
+        raise XrgsError(f"out={out}: the sheet is a PNG; name a file FILE.png")
+    words = (*variant, f"store={store}") if store else variant
+    say(describe(_variant(words), out))
 
 
 def _variant(words: Sequence[str]) -> Path:
@@ -115,7 +120,7 @@ def _variant(words: Sequence[str]) -> Path:
     if path.exists() and not (path / IDENTITY).is_file():
         words = last_of_each_key([*as_they_are(first), *others])
     elif "=" not in first:
-        store = Store(next((w[6:] for w in others if w.startswith("store=")), STORE))
+        store = Store(next((user_path(w[6:]) for w in others if w.startswith("store=")), STORE))
         if not path.exists() and not store.exists:
             raise XrgsError(f"{first}: there is no such folder, and no store {store.path}")
         folder = store.find_folder(first)

@@ -117,7 +117,9 @@ def _explained(error: Exception) -> str:
 
 def _malformed(word: str, message: str) -> str:
     """Return a message with a correction of a word that Hydra's grammar refuses with a message."""
-    key, _, value = word.partition("=")
+    key, equals, value = word.partition("=")
+    if not equals:
+        return f"{word}: write KEY=VALUE, as seed=1; one folder of photographs is taken"
     call = _CALL.search(message)
     whole, name, inside = call.group("call", "name", "inside") if call else ("", "", "")
     axis = inside if inside.endswith(")") else whole

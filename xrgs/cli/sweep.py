@@ -6,7 +6,6 @@ import os
 import sys
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import hydra
@@ -160,7 +159,7 @@ def _rerun(arguments: list[str]) -> None:
         conf = OmegaConf.merge(OmegaConf.structured(RerunConf), texts(arguments))
         out, store = (user_path(path) if path else None for path in (conf.out, conf.store))
         photographs, plugins = conf.scene.path, conf.plugins.split(",")
-        cell, home = Path(conf.rerun), Store(store or DEFAULT_STORE)
+        cell, home = user_path(conf.rerun), Store(store or DEFAULT_STORE)
         if not cell.exists() and home.exists:
             cell = home.find_cell(conf.rerun).path
         result = rerun(cell, out, store, conf.threads, photographs, plugins)

@@ -29,6 +29,7 @@ from xrgs.runtime.streams import say
 from xrgs.runtime.text import format_duration
 from xrgs.safeio.sanitize import counted, for_line
 from xrgs.splat.settings import NOMINAL_STEPS
+from xrgs.store.export import check_place
 from xrgs.store.store import BASELINE, Store
 
 if TYPE_CHECKING:
@@ -122,8 +123,10 @@ def train(settings: Settings) -> None:
     if settings.minutes is not None and (settings.quality != "normal" or not settings.minutes > 0):
         raise XrgsError(f"minutes={settings.minutes:g}: must be above 0, and without --quality")
     if settings.out is not None:
-        form_of(settings.out)
+        check_place(settings.out, form_of(settings.out))
     words = _words(settings)
+    if settings.recipe:  # a wrong name is found before the cameras are
+        _Words(words.given, [*words.own, *_recipe(settings.recipe)]).compose()
     if settings.minutes and settings.size is None:
         side = budget.size_for(60 * settings.minutes, _measured_unit(words.compose()))
         words.own.append(f"variant.long_side={side}")

@@ -12,6 +12,7 @@ for scores of views, since a gap in seconds or Gaussians means nothing.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -65,6 +66,11 @@ class Design:
     """The largest change of PSNR that counts as none, dB; our choice."""
     margin_lpips: float = 5.0
     """The largest change of LPIPS that counts as none, %; our choice."""
+
+    def __post_init__(self) -> None:
+        for name in ("margin_psnr", "margin_lpips"):
+            if not (margin := getattr(self, name)) >= 0 or math.isinf(margin):
+                raise ReportError(f"{name}={margin:g}: must be a number of at least 0")
 
     def margin(self, metric: Metric) -> float:
         """Return the margin of a metric in the unit of its effect; 0 if it has none."""

@@ -235,9 +235,9 @@ class _Page:
         tables, printed = self._tables, list(self._overviews)
         if len(tables.comparison.groups) <= _MAX_PRINTED_ABLATIONS:
             printed += self._ablations
-        if tables.comparison.groups:
+        if any(table.rows for table in printed):
             printed.append(legend(tables.comparison, printed))
-        else:
+        else:  # nothing can be compared, or not yet
             printed += [tables.values(name) for name in self._conditions]
         if missing := tables.missing():
             more = len(missing.rows) - _MAX_PRINTED_MISSING

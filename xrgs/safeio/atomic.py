@@ -22,6 +22,7 @@ def atomic_writer(path: Path, *, durable: bool = True) -> Iterator[IO[bytes]]:
     The content is written to a temporary file in the same folder, which must exist, and is renamed
     at the end. If that fails with an OSError, the old file is as it was. A `durable` file is waited
     for until content and name are on the disk; else the new content can be lost in a power failure.
+    An OSError of writing has the name of the file, `path`.
     """
     # Not mkstemp: only the owner could read its files, and a store is shared by a team.
     temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}")
@@ -32,6 +33,12 @@ def atomic_writer(path: Path, *, durable: bool = True) -> Iterator[IO[bytes]]:
             if durable:
                 os.fsync(stream.fileno())
         temporary.replace(path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        # A full disk names no file, and the temporary one's name tells nobody anything.
+        if error.errno is None or error.filename not in {None, str(temporary)}:
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from error
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise

@@ -236,23 +236,27 @@ def import_store(source: Path, store: Store) -> Imported:
         StoreError: The source is no store; an archive is damaged, or has a link or a name outside
             its folder; or the store can't be written.
     """
+    with errors_named(source):
+        is_folder = stat.S_ISDIR(source.stat().st_mode)
+    root = _root(source, source) if is_folder else None  # before a store is made for it
     store.prepare()
     with errors_named(store.path), lease.waited_for(store.path, ".import.lock"):
         importing = _Import(store.path)
         importing.clear()
         try:
-            return importing.copy_all(_root(source, store.path / _STAGING))
+            return importing.copy_all(root or _unpacked(source, store.path / _STAGING))
         finally:
             importing.clear()
 
 
-def _root(source: Path, unpacked: Path) -> Path:
-    """Return the folder of the source that has `cells`; an archive is unpacked first."""
-    folder = source
-    if not source.is_dir():
-        unpacked.mkdir()
-        _unpack(source, unpacked)
-        folder = unpacked
+def _unpacked(archive: Path, folder: Path) -> Path:
+    folder.mkdir()
+    _unpack(archive, folder)
+    return _root(archive, folder)
+
+
+def _root(source: Path, folder: Path) -> Path:
+    """Return the folder that has `cells`, of the folder of a source; messages name the source."""
     with errors_named(source):
         inside = sorted(path for path in folder.iterdir() if path.is_dir())
     for root in (folder, *inside):  # the store may have a folder around it
@@ -271,8 +275,11 @@ def _unpack(archive: Path, folder: Path) -> None:
         except Exception as error:
             if isinstance(error, OSError) and error.errno is not None:
                 raise
-            # tarfile, zlib and lzma raise errors of many types for damaged data.
-            raise StoreError(f"{archive}: not an archive of a store ({error})") from error
+            # tarfile, zlib and lzma raise errors of many types for damaged data. tarfile's message
+            # on a file of no format has a line for each format.
+            lines = str(error).splitlines()
+            why = "it is no .tar, .tar.xz, .tar.gz or .tar.bz2" if len(lines) > 1 else error
+            raise StoreError(f"{archive}: not an archive of a store ({why})") from error
 
 
 def _regular_files(member: tarfile.TarInfo, folder: str) -> tarfile.TarInfo | None:

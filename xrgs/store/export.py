@@ -63,10 +63,9 @@ def export(path: Path, layout: str, out: Path) -> str:
     cell = _cell(path)
     frozen = variant.load(path) if cell is None else cell.variant()
     data = dataset.load(frozen) if cell is None else cell.dataset()
+    check_place(out, layout)
     try:
         out.mkdir(parents=True, exist_ok=True)
-        if any(out.iterdir()):
-            raise XrgsError(f"out={out}: is not empty; name a new folder")
         images = _write_images(data, out)
         write_json(out / "transform.json", {"sfm_to_export": transform(frozen).tolist()})
         _LAYOUTS[layout](data, images, out)
@@ -100,10 +99,7 @@ def export_splats(path: Path, form: str, out: Path) -> str:
     """
     from xrgs.formats.files import load_gaussians, save_gaussians
 
-    if out.suffix.lower() != f".{form}":
-        raise XrgsError(f"out={out}: the name of a {form} file must end with .{form}")
-    if out.is_dir():
-        raise XrgsError(f"out={out}: is a folder; name a file")
+    check_place(out, form)
     up, total = {}, 0
     if path.suffix and not path.is_dir():
         gaussians, antialiased = load_gaussians(path)
@@ -116,12 +112,31 @@ def export_splats(path: Path, form: str, out: Path) -> str:
         viewmats = np.stack([view.camera.viewmat.numpy() for view in cell.dataset().train])
         up = {"up": -viewmats[:, 1, :3].mean(axis=0)}  # y of a camera points down
     try:
+        out.parent.mkdir(parents=True, exist_ok=True)
         save_gaussians(out, gaussians, antialiased=antialiased, **up)
     except OSError as error:
         raise XrgsError(f"out={out}: {error.strerror}") from error
     kind = "antialiased Gaussians" if antialiased else "Gaussians"
     left_out = f" of {total}, without those that no render shows" if total > len(gaussians) else ""
     return f"{len(gaussians)} {kind}{left_out}: written to {out}"
+
+
+def check_place(out: Path, form: str) -> None:
+    """Raise `XrgsError` where an export can't be written to `out`, for its name or what is there.
+
+    Args:
+        out: The file or the folder to write.
+        form: The format of the export.
+    """
+    if form in SPLAT_FORMATS:
+        if out.suffix.lower() != f".{form}":
+            raise XrgsError(f"out={out}: the name of a {form} file must end with .{form}")
+        if out.is_dir():
+            raise XrgsError(f"out={out}: is a folder; name a file")
+    elif out.is_dir() and any(out.iterdir()):
+        raise XrgsError(f"out={out}: is not empty; name a new folder")
+    elif out.exists() and not out.is_dir():
+        raise XrgsError(f"out={out}: is a file; name a new folder")
 
 
 def without_invisible(gaussians: Gaussians, alpha_min: float) -> Gaussians:

@@ -185,13 +185,14 @@ def describe(folder: Path, out: Path | None = None) -> str:
     sheet, notes = contact_sheet(frozen)
     file = out or Path(f"{frozen.id}.png")
     try:
+        file.parent.mkdir(parents=True, exist_ok=True)
         with atomic_writer(file) as stream:
             images.write_png(stream, sheet)
     except OSError as error:
         if out is None:
             why = f"the sheet {file} can't be written here ({error.strerror}); give --out=FILE.png"
             raise XrgsError(why) from error
-        raise XrgsError(f"out={file}: can't be written ({error})") from error
+        raise XrgsError(f"out={file}: can't be written ({error.strerror})") from error
     more = [f"Contact sheet: {file}", *(f"  {note}" for note in notes)]
     return "\n".join([table, _mixture(frozen), *sfm, *map(for_line, more)])
 

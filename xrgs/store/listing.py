@@ -271,7 +271,10 @@ def full_id(
     if len(matches) == 1:
         return next(iter(matches))
     some = listed([f"{full}{label}" for full, label in matches.items()], _MAX_LISTED)
-    why = f"no {kinds} have such an id, and no done cell is of a scene with this name"
+    of_sweeps = kinds == "sweeps"
+    lists = "xrgs-report list has all" if of_sweeps else "xrgs-status lists the done ones"
+    of_scene = "none has" if of_sweeps else "no done cell is of"
+    why = f"no {kinds} have such an id, and {of_scene} a scene with this name"
     if matches:
         why = f"several {kinds} have such an id or scene: {some}"
-    raise StoreError(f"{word}: {why}; xrgs-status lists the done ones")
+    raise StoreError(f"{word}: {why}; {lists}")

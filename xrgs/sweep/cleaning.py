@@ -171,7 +171,9 @@ def carry_out(store: Store, plan: Plan) -> tuple[int, list[str]]:
                 why: str | None = "it is left: a sweep is training it"
             else:
                 why = item.act()
-        except (OSError, StoreError) as error:
+        except OSError as error:
+            why = f"{error.filename}: {error.strerror}"
+        except StoreError as error:
             why = str(error)
         finally:
             if held:
@@ -192,13 +194,14 @@ def _without_running(cells: Iterable[CellRow]) -> tuple[list[CellRow], list[str]
 
 
 def _recorded(cells: Sequence[CellRow]) -> list[str]:
-    """Return a note on done cells that reports of sweeps would lose."""
+    """Return a note on the sweeps whose reports lose numbers."""
     done = [cell for cell in cells if cell.state.name == "done" and cell.sweeps]
     if not done:
         return []
     sweeps = {sweep_id for cell in done for sweep_id in cell.sweeps}
     return [
-        f"done, and in reports of {counted(len(sweeps), 'sweep')}: {counted(len(done), 'cell')}"
+        f"reports of {counted(len(sweeps), 'sweep')} lose the numbers of"
+        f" {counted(len(done), 'done cell')}"
     ]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
@@ -130,8 +131,9 @@ def _scores(folder: CellFolder) -> Iterator[str]:
     except (StoreError, OSError):
         return  # a cell that is not done has none, and its state says why
     for metric in METRICS:
-        if metric.name in metrics:
-            yield f"{metric.name}: {metrics[metric.name]:,.6g} {metric.unit}".rstrip()
+        value = metrics.get(metric.name, math.nan)
+        if not math.isnan(value):  # no view was scored by it
+            yield f"{metric.name}: {value:,.6g} {metric.unit}".rstrip()
 
 
 def _provenance(folder: CellFolder) -> Iterator[str]:

@@ -565,9 +565,10 @@ def main(work: str, request: str, answer: str) -> None:
     except XrgsError as error:
         result = Answer(error=str(error))
     except Exception as error:
-        if "store" not in given or not Store(given["store"]).is_gone:  # the parent says so
-            say(traceback.format_exc(), sys.stderr)
         full = isinstance(error, OSError) and unwritable(error)
+        gone = "store" in given and Store(given["store"]).is_gone
+        if not (full or gone):  # the parent says so
+            say(traceback.format_exc(), sys.stderr)
         outcome = UNWRITABLE if full else "failed"
         result = Answer(error=f"{type(error).__name__}: {error}", outcome=outcome)
     try:

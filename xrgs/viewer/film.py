@@ -18,6 +18,7 @@ from xrgs.photos.images import write_png
 from xrgs.runtime.progress import progress
 from xrgs.safeio.atomic import atomic_writer
 from xrgs.safeio.files import list_names
+from xrgs.safeio.sanitize import counted
 from xrgs.splat.cameras import Camera
 from xrgs.splat.rendering import rasterize
 from xrgs.viewer.models import reference
@@ -92,7 +93,7 @@ def make_film(
         raise XrgsError(f"out={out}: can't be written ({error.strerror or error})") from error
     shown = f"{len(models) * camera.width} x {camera.height} px"
     length = f", {views / fps:.1f} s" if is_film else ""
-    return f"{out}: {views} frames of {shown}{length}, path {path}"
+    return f"{out}: {counted(views, 'frame')} of {shown}{length}, path {path}"
 
 
 def _check(path: str | None, views: int, fps: int, size: tuple[int, int] | None) -> None:
