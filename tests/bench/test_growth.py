@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from xrgs.bench.growth import ALL_LOADS, fit_growth
+from xrgs.bench.plot import ALL_LOADS, fit_growth
 
 GAUSSIANS, SIDES = (10, 100, 1000), (10, 20)
 

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Rectangle
 
 from xrgs.bench import plot
-from xrgs.bench.growth import fit_growth
+from xrgs.bench.plot import fit_growth
 from xrgs.bench.training import STEP_PARTS
 
 METHODS = ("native", "native, stop at 1e-2", "torch", "torch float64")

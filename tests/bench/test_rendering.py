@@ -10,8 +10,7 @@ import torch
 
 from xrgs.bench import rendering
 from xrgs.bench.loads import Load, random_load
-from xrgs.bench.rendering import RenderMethod, RenderTask
-from xrgs.bench.timing import time_interleaved, use_threads
+from xrgs.bench.rendering import RenderMethod, RenderTask, time_interleaved, use_threads
 from xrgs.splat.backend import resolve_backend
 from xrgs.splat.settings import CullingOptions, RasterSettings
 

@@ -11,10 +11,10 @@ import torch
 from PIL import Image
 
 from tests.store.cells import finished, identity, write_variant
+from xrgs.errors import StoreError
 from xrgs.store.archive import import_store, pack
 from xrgs.store.store import Store
-from xrgs.store.texture import FILE, texture, texture_of, textures
-from xrgs.store.trimming import trim_variant
+from xrgs.store.trimming import TEXTURES, home_of, texture, textures, trim_variant
 from xrgs.training.components.texture import gradient_magnitude
 
 
@@ -48,17 +48,15 @@ def test_a_masked_photograph_has_the_texture_of_the_used_part(variant: Path) -> 
     mask[:, 15:] = 255
     Image.fromarray(mask).save(variant / "images" / "test-masks" / "b.png")
     part = (image[:, 15:] / 255).astype(np.float32)
-    assert texture_of(variant, "test/b") == pytest.approx(texture(part), rel=1e-6)
-    assert list(textures(variant)) == ["test/b"]
+    assert textures(variant) == {"test/b": pytest.approx(texture(part), rel=1e-6)}
 
 
 def test_a_trimmed_variant_keeps_its_textures(variant: Path) -> None:
-    assert texture_of(variant, "test/b") == pytest.approx(0.2)
-    assert math.isnan(texture_of(variant, "train/a"))  # no PNG
+    kept = {"test/b": pytest.approx(0.2)}
+    assert textures(variant, ["test/b", "train/a"]) == kept  # train/a is no PNG
     trim_variant(variant.parent, variant.name)
     trim_variant(variant.parent, variant.name)
-    assert texture_of(variant, "test/b") == pytest.approx(0.2)
-    assert math.isnan(texture_of(variant, "train/a"))
+    assert textures(home_of(variant.parent, variant.name)) == kept
 
 
 @pytest.mark.parametrize("is_trimmed", [False, True])
@@ -71,14 +69,15 @@ def test_a_pack_has_the_textures_and_an_import_takes_them(
         trim_variant(variant.parent, variant.name)
     pack(store, store.cell_folders(), tmp_path / "a.tar.xz", tmp_path)
     import_store(tmp_path / "a.tar.xz", other)
-    assert texture_of(other.variant(variant.name), "test/b") == pytest.approx(0.2)
+    assert textures(home_of(other.variants, variant.name)) == {"test/b": pytest.approx(0.2)}
 
 
 def test_damaged_textures_are_not_imported(variant: Path, tmp_path: Path) -> None:
     store = Store(tmp_path / "s")
     trim_variant(variant.parent, variant.name)
-    (variant.parent / f"trimmed-{variant.name}" / FILE).write_text('{"test/b": "much"}')
-    assert math.isnan(texture_of(variant, "test/b"))
+    (variant.parent / f"trimmed-{variant.name}" / TEXTURES).write_text('{"test/b": "much"}')
+    with pytest.raises(StoreError, match="damaged"):
+        textures(home_of(variant.parent, variant.name))
     found = import_store(store.path, Store(tmp_path / "o"))
     assert found.variants == 0
-    assert FILE in found.left_out[0]
+    assert TEXTURES in found.left_out[0]

@@ -13,7 +13,7 @@ from xrgs.config import Conf
 from xrgs.errors import StoreError, UnreadableError
 from xrgs.safeio.files import list_names
 from xrgs.safeio.hashing import file_digest
-from xrgs.store import restore, trimming
+from xrgs.store import trimming
 from xrgs.store.attempts import remove_cell
 from xrgs.store.cell_folder import CellFolder
 from xrgs.store.store import Store
@@ -134,7 +134,7 @@ def again(
             if error:
                 raise error
 
-        monkeypatch.setattr(restore, "restore_images", images)
+        monkeypatch.setattr(trimming, "restore_images", images)
         conf = compose("scene=motorcycle")
         trimming.restore_variant(variants, variant_id, conf.scene, conf.variant, variants)
 

@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from xrgs.errors import XrgsError
-from xrgs.sweep.axes import expand
-from xrgs.sweep.axis_values import as_name
+from xrgs.sweep.axes import as_name, expand
 
 
 def values(written: str) -> list[str]:

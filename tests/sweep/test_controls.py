@@ -8,8 +8,7 @@ import pytest
 
 from xrgs.errors import XrgsError
 from xrgs.store.store import BASELINE
-from xrgs.sweep.controls import mixed_prune_rules
-from xrgs.sweep.plan import PlannedCell
+from xrgs.sweep.plan import PlannedCell, mixed_prune_rules
 from xrgs.sweep.study import Study
 
 

@@ -14,7 +14,7 @@ from xrgs.errors import XrgsError
 from xrgs.runtime import lease
 from xrgs.store.listing import Selection
 from xrgs.store.store import Store
-from xrgs.sweep.inventory import list_cells, list_sweeps, show
+from xrgs.sweep.status import list_cells, list_sweeps, show
 
 
 @pytest.fixture

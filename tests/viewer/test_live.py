@@ -19,8 +19,8 @@ from PIL import Image
 
 from xrgs.errors import XrgsError
 from xrgs.viewer import live
+from xrgs.viewer.live import to_splats
 from xrgs.viewer.models import Model
-from xrgs.viewer.splats import to_splats
 
 MakeModel = Callable[..., Model]
 

@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from xrgs.splat.gaussians import Gaussians
-from xrgs.viewer.splats import to_splats
+from xrgs.viewer.live import to_splats
 
 
 def random_gaussians(count: int) -> Gaussians:

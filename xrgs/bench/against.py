@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from xrgs.bench.loads import Load
-    from xrgs.bench.timing import Row
+    from xrgs.bench.rendering import Row
 
     #: (side, task, number of threads) -> time of each repetition, ms.
     Durations = Mapping[tuple[str, str, int], NDArray[np.float64]]

@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 from matplotlib import style
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
+from scipy.stats import linregress
 
-from xrgs.bench.growth import ALL_LOADS
 from xrgs.bench.rendering import TORCH_FLOAT64, total_ms
-from xrgs.bench.timing import Row
 from xrgs.bench.training import STEP_PARTS
 from xrgs.photos.images import SOFTWARE
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from matplotlib.axes import Axes
+
+    from xrgs.bench.rendering import Row
 
 _DPI = 150
 _SIZE = (4.6, 4.2)  # of a panel, inches
@@ -147,3 +151,41 @@ def _describe(row: Row) -> str:
 
 def _size(row: Row) -> str:
     return f"{row['width']}x{row['height']}"
+
+
+ALL_LOADS = "all loads"
+
+
+def fit_growth(rows: Sequence[Row]) -> list[Row]:
+    """Fit power laws to the times of the first method on one thread.
+
+    Returns:
+        A row for each growing quantity (`grows`: "Gaussians" or "pixels") and each size of the
+        other quantity (`at`), with `sizes` in ascending order, `ms` (forward plus backward), and
+        the `exponent` of the power law: 1 if doubling the size doubles the time. The last two rows
+        are for a fit to all loads. Quantities that do not vary have no rows.
+    """
+    frame = pd.DataFrame(rows)
+    frame = frame[(frame["method"] == rows[0]["method"]) & (frame["threads"] == 1)]
+    frame = pd.DataFrame(
+        {
+            "Gaussians": frame["gaussians"],
+            "pixels": frame["width"] * frame["height"],
+            "size": frame["width"].astype(str) + "x" + frame["height"].astype(str),
+            "count": frame["gaussians"].map("{:,} Gaussians".format),
+            "ms": frame["forward_ms"] + frame["backward_ms"],
+        }
+    )
+    fits: list[Row] = []
+    for grows, fixed, name in (("Gaussians", "pixels", "size"), ("pixels", "Gaussians", "count")):
+        for _, group in frame.sort_values(grows).groupby(fixed):
+            if len(group) > 1:
+                fit = linregress(np.log(group[grows]), np.log(group["ms"]))
+                row = {"grows": grows, "at": group[name].iloc[0], "sizes": group[grows].tolist()}
+                fits.append(row | {"ms": group["ms"].tolist(), "exponent": float(fit.slope)})
+    if len({row["grows"] for row in fits}) == 2:
+        columns = [np.ones(len(frame)), np.log(frame["Gaussians"]), np.log(frame["pixels"])]
+        _, *slopes = np.linalg.lstsq(np.stack(columns, axis=1), np.log(frame["ms"]), rcond=None)[0]
+        for grows, slope in zip(("Gaussians", "pixels"), slopes, strict=True):
+            fits.append({"grows": grows, "at": ALL_LOADS, "exponent": float(slope)})
+    return fits

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import time
+from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from statistics import median
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 from torch import Tensor
 
-from xrgs.bench.loads import Load
-from xrgs.bench.timing import Row, time_interleaved, use_threads
 from xrgs.splat.gaussians import ActivatedGaussians
 from xrgs.splat.rendering import Render, rasterize_parameters
 from xrgs.splat.settings import CullingOptions, RasterSettings
 from xrgs.splat.sh import bases
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping, Sequence
+
+    from xrgs.bench.loads import Load
 
 #: Width and height of the part of a view that is compared with a render in float64, px. A whole
 #: large view would take minutes in float64.
@@ -285,3 +289,38 @@ def _compare_shortcuts(
             }
         )
     return rows
+
+
+Row = dict[str, Any]  # column -> value
+_Key = TypeVar("_Key")
+
+
+def time_interleaved(
+    tasks: Mapping[_Key, Callable[[], object]], repeats: int
+) -> dict[_Key, list[float]]:
+    """Run each task once to warm up, then all tasks in turn (A B A B ...).
+
+    Returns:
+        Key -> duration of each run, ms.
+    """
+    for task in tasks.values():
+        task()
+    durations: dict[_Key, list[float]] = {key: [] for key in tasks}
+    # In turn, so that other work on the machine slows down all tasks alike.
+    for _ in range(repeats):
+        for key, task in tasks.items():
+            start = time.perf_counter()
+            task()
+            durations[key].append(1e3 * (time.perf_counter() - start))
+    return durations
+
+
+@contextmanager
+def use_threads(count: int) -> Iterator[None]:
+    """Set the number of threads of torch and of the native kernels for a `with` block."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)  # the native kernels read torch's number
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

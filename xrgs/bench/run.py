@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
 
-from xrgs.bench import against, growth, loads, plot, rendering, tables, training
+from xrgs.bench import against, loads, plot, rendering, tables, training
 from xrgs.errors import XrgsError
 from xrgs.runtime.machine import usable_cores
 from xrgs.runtime.progress import progress
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from xrgs.bench.loads import Load
+    from xrgs.bench.rendering import Row
     from xrgs.bench.settings import Settings
-    from xrgs.bench.timing import Row
 
 
 class BenchmarkSizes(NamedTuple):
@@ -141,7 +141,7 @@ def _measure(
     results = {
         "machine": msgspec.to_builtins(provenance.collect(counts[-1], backend)),
         "rows": rows,
-        "growth": growth.fit_growth(rows),
+        "growth": plot.fit_growth(rows),
         "steps": training.time_steps(views, backend, counts, repeats),
         "shortcuts": shortcuts,
         "step_shortcuts": training.time_shortcuts(step, backend, repeats),

@@ -6,8 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from xrgs.bench.against import HR_SHARE, SIDES
-from xrgs.bench.rendering import STAGES
-from xrgs.bench.timing import Row
+from xrgs.bench.rendering import STAGES, Row
 
 # Columns of each table: heading -> format string for the values of a row.
 _SIZES = {"threads": "{threads}", "Gaussians": "{gaussians}", "size": "{width}x{height}"}

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from xrgs.bench.loads import Load, random_load
-from xrgs.bench.timing import Row, time_interleaved, use_threads
+from xrgs.bench.rendering import Row, time_interleaved, use_threads
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.splat.loss import photometric_loss, prepare_target
 from xrgs.splat.optimizer import SplatOptimizer

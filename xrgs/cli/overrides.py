@@ -21,7 +21,7 @@ from xrgs.composing import escape_interpolations
 from xrgs.errors import XrgsError, did_you_mean
 from xrgs.photos.scenes.scene import ALL_BELOW
 from xrgs.safeio.paths import user_path
-from xrgs.sweep.axis_values import as_name
+from xrgs.sweep.axes import as_name
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

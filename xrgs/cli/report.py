@@ -73,9 +73,9 @@ def list_sweeps(store: Folder = STORE) -> None:
     Args:
         store: The store.
     """
-    from xrgs.sweep import inventory
+    from xrgs.sweep import status
 
-    say(inventory.list_sweeps(Store(store).sweep_rows()))
+    say(status.list_sweeps(Store(store).sweep_rows()))
 
 
 def main() -> None:

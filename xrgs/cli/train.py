@@ -17,10 +17,9 @@ from tyro.conf import Positional, arg
 
 from xrgs import composing
 from xrgs.cli import budget, options, sweep
-from xrgs.cli.data import form_of, write_export
+from xrgs.cli.data import as_they_are, form_of, last_of_each_key, write_export
 from xrgs.cli.options import STORE, Flag, Folder, OptionalFolder, shown_as
 from xrgs.cli.overrides import check_no_axis, explained, with_quotes
-from xrgs.cli.photographs import as_they_are, last_of_each_key
 from xrgs.errors import StoreError, XrgsError
 from xrgs.photos import scenes
 from xrgs.runtime.machine import usable_cores
@@ -179,7 +178,7 @@ def _place(words: _Words) -> _Placed | None:
     Raises:
         XrgsError: There are too few photographs, or too few are placed.
     """
-    from xrgs.report.joined import ReportStore
+    from xrgs.report.collect import ReportStore
     from xrgs.store.inspect import mixture
     from xrgs.sweep import build_variants
     from xrgs.sweep.estimate import read_views
@@ -271,7 +270,7 @@ def _units_of_a_step(placed: _Placed, conf: Conf) -> float:
 def _say_end(placed: _Placed, conf: Conf, settings: Settings, seconds: float) -> None:
     """Print the result, its page and the next commands, in at most eight lines."""
     from xrgs.report.page import PAGE
-    from xrgs.sweep.ending import next_commands
+    from xrgs.sweep.status import next_commands
 
     store, name = Store(conf.store), scenes.label(conf.scene)
     cell = _cell(placed, conf)

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from xrgs.mixture.views import View
-    from xrgs.report.joined import ReportStore
+    from xrgs.report.collect import ReportStore
 
 #: Another program's renders become one row for each combination of these columns.
 _VARIANT = ["scene", "condition", "variant_seed"]

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
+from xrgs.errors import StoreError
 from xrgs.report.averages import averaged
 from xrgs.report.compare import is_ratio
 from xrgs.report.context import context_of
@@ -23,19 +24,19 @@ from xrgs.report.writing import (
     same_sign,
     signed,
 )
-from xrgs.runtime.progress import progress
+from xrgs.runtime.progress import ProgressBar
 from xrgs.runtime.text import TextTable, listed
 from xrgs.safeio.sanitize import counted
 from xrgs.store.store import BASELINE
-from xrgs.store.texture import texture_of
+from xrgs.store.trimming import home_of, textures
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Collection, Iterable, Mapping, Sequence
 
     from xrgs.evaluation.metrics import Metric
+    from xrgs.report.collect import ReportStore
     from xrgs.report.compare import Comparison
     from xrgs.report.context import Context
-    from xrgs.report.joined import ReportStore
     from xrgs.report.writing import Change
 
 #: Labels of the full XR-GS; each reads section 5.4 of the paper in another way.
@@ -230,11 +231,14 @@ def with_texture(store: ReportStore, cells: pd.DataFrame, views: pd.DataFrame) -
     scored = cells.drop_duplicates("cell_id").set_index("cell_id")[["variant_id", "validation"]]
     rows = views.join(scored, on="cell_id")
     rows["split"] = np.where(rows["validation"] > 0, "train", "test")
-    photographs = rows[_PHOTOGRAPH].drop_duplicates()
-    bar = progress(photographs.to_numpy(), "reading photographs", "photograph", len(photographs))
-    photographs["texture"] = [
-        texture_of(store.variant(variant_id), f"{split}/{view}") for variant_id, split, view in bar
-    ]
+    photographs = rows[_PHOTOGRAPH].drop_duplicates().assign(texture=np.nan)
+    names = photographs["split"] + "/" + photographs["view"]
+    with ProgressBar("reading photographs", "photograph", len(photographs)) as bar:
+        for variant_id, views_of in names.groupby(photographs["variant_id"], sort=False):
+            with suppress(StoreError):
+                known = textures(home_of(store.variants, str(variant_id)), [*views_of])
+                photographs.loc[views_of.index, "texture"] = views_of.map(known)
+            bar.update(len(views_of))
     found = rows.merge(photographs, on=_PHOTOGRAPH, how="left")["texture"]
     return views.assign(texture=found.to_numpy(np.float64))
 
@@ -352,50 +356,34 @@ _FIGURES = (
 )
 
 
-@dataclass(frozen=True)
-class Counterpart:
-    """The view on the page that corresponds to a figure of the paper."""
-
-    name: str
-    shows: str
-    here: str
-    """The name of the view, or why there is none."""
-    section: str = ""
-    """The section of the page with the view, `views` or `training`; empty without a view."""
-    place: int = 0
-    """The index of the view in that section."""
-    label: str = ""
-    """The ablation to select there."""
-
-
 def counterparts(
-    labels: Iterable[str], views: Sequence[dict[str, Any]], training: Sequence[dict[str, Any]]
-) -> list[Counterpart]:
+    labels: Collection[str], views: Sequence[dict[str, Any]], training: Sequence[dict[str, Any]]
+) -> list[dict[str, Any]]:
     """Find the view on a report's page that corresponds to each figure of the paper.
 
-    The views are those of `xrgs.report.html.content.Content`.
+    The views are those of `xrgs.report.html.content.Content`. A view has its `section` of the page,
+    `views` or `training`, its `place` there, and the `label` to select. `here` is its name, or why
+    there is none.
     """
-    names = set(labels)
-    return [_counterpart(figure, training if figure.tag else views, names) for figure in _FIGURES]
-
-
-def _counterpart(
-    figure: _Figure, entries: Sequence[dict[str, Any]], labels: set[str]
-) -> Counterpart:
-    if figure.ablation not in labels:
-        why = f"this sweep has no cell of it: xrgs-sweep +ablation={figure.ablation} trains it"
-        return Counterpart(figure.name, figure.shows, why)
-    fitting = [
-        place
-        for place, entry in enumerate(entries)
-        if entry.get("tag", "") == figure.tag
-        and any(arm["label"] == figure.ablation and "image" in arm for arm in entry["arms"])
-    ]
-    if not fitting:
-        return Counterpart(figure.name, figure.shows, "the page has no picture of it, see below")
-    same_scene = [place for place in fitting if entries[place]["scene"] in figure.scenes]
-    place = (same_scene or fitting)[0]
-    shown = entries[place]
-    here = f"{shown['scene']}, view {shown['view']}, {figure.ablation}"
-    section = "training" if figure.tag else "views"
-    return Counterpart(figure.name, figure.shows, here, section, place, figure.ablation)
+    found = []
+    for figure in _FIGURES:
+        section, entries = ("training", training) if figure.tag else ("views", views)
+        fitting = [
+            place
+            for place, entry in enumerate(entries)
+            if entry.get("tag", "") == figure.tag
+            and any(arm["label"] == figure.ablation and "image" in arm for arm in entry["arms"])
+        ]
+        row: dict[str, Any] = {"name": figure.name, "shows": figure.shows, "section": ""}
+        if figure.ablation not in labels:
+            what = f"xrgs-sweep +ablation={figure.ablation} trains it"
+            row["here"] = f"this sweep has no cell of it: {what}"
+        elif not fitting:
+            row["here"] = "the page has no picture of it, see below"
+        else:
+            same_scene = [place for place in fitting if entries[place]["scene"] in figure.scenes]
+            place = (same_scene or fitting)[0]
+            here = f"{entries[place]['scene']}, view {entries[place]['view']}, {figure.ablation}"
+            row |= {"here": here, "section": section, "place": place, "label": figure.ablation}
+        found.append(row)
+    return found

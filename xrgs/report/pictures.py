@@ -39,8 +39,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from xrgs.report.collect import ReportStore
     from xrgs.report.compare import Comparison
-    from xrgs.report.joined import ReportStore
 
     _Drawing = Callable[[Path], "Picture"]  # draws into the file
 

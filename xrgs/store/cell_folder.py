@@ -440,6 +440,20 @@ class CellFolder:
         }
 
 
+def number_columns(file: Path) -> dict[str, list[float]]:
+    """Read a table of numbers by columns, without the column `view`, which is text.
+
+    Raises:
+        StoreError: The file is missing or damaged, or a value is not a number.
+    """
+    header, rows = read_table(file)
+    places = [(place, name) for place, name in enumerate(header) if name != "view"]
+    try:
+        return {name: [as_number(row[place]) for row in rows] for place, name in places}
+    except ValueError as error:
+        raise StoreError(f"damaged: {file}: {error}") from error
+
+
 def _is_heavy(name: str) -> bool:
     """Return whether a file of a done cell is needed only by pictures, viewers and `rerun=`."""
     return name == "splats.ply" or name.startswith("renders/")

@@ -19,7 +19,7 @@ from xrgs.splat.backend import arithmetic
 from xrgs.store.identity import changed_code
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Iterable, Mapping
     from pathlib import Path
 
     from xrgs.store.cell_folder import CellFolder, CellState
@@ -184,61 +184,6 @@ def modified(file: Path) -> float | None:
         return file.stat().st_mtime_ns / 1e9
     except OSError:
         return None
-
-
-@dataclass(frozen=True)
-class Selection:
-    """Which cells of a store are meant; an empty value or 0 restricts nothing."""
-
-    ids: tuple[str, ...] = ()
-    """Ids, beginnings of ids, or names of scenes with one done cell."""
-    scenes: tuple[str, ...] = ()
-    ablations: tuple[str, ...] = ()
-    states: tuple[str, ...] = ()
-    sweeps: tuple[str, ...] = ()
-    """Ids of sweeps; a chosen cell is in one of them."""
-    older_days: float = 0.0
-    larger_mb: float = 0.0
-
-    @property
-    def restricts(self) -> bool:
-        """Whether any value restricts the choice."""
-        return self != Selection()
-
-    def choose_from(self, cells: Sequence[CellRow]) -> list[CellRow]:
-        """Return the cells that are meant.
-
-        Raises:
-            XrgsError: No cell has a name that is given, or several ids have one beginning.
-        """
-        ids = [cell.id for cell in cells]
-        done = [cell for cell in cells if cell.state.name == "done"]
-        named = {
-            full_id(word, ids, done={cell.id: cell.arm for cell in done if cell.scene == word})
-            for word in self.ids
-        }
-        self._check("scenes", self.scenes, [cell.scene for cell in cells])
-        self._check("ablations", self.ablations, [cell.label for cell in cells])
-        self._check("states", self.states, STATES)
-        self._check("sweep", self.sweeps, [name for cell in cells for name in cell.sweeps])
-        return [
-            cell
-            for cell in cells
-            if (not named or cell.id in named)
-            and (not self.scenes or cell.scene in self.scenes)
-            and (not self.ablations or cell.label in self.ablations)
-            and (not self.states or cell.state.name in self.states)
-            and (not self.sweeps or not {*self.sweeps}.isdisjoint(cell.sweeps))
-            and (not self.older_days or (cell.age_s or 0.0) >= 86400 * self.older_days)
-            and (not self.larger_mb or (cell.bytes or 0) >= 1e6 * self.larger_mb)
-        ]
-
-    @staticmethod
-    def _check(key: str, names: Sequence[str], existing: Sequence[str]) -> None:
-        for name in names:
-            if name not in existing:
-                choices = ", ".join(dict.fromkeys(existing)) or "none"
-                raise XrgsError(f"{key}={name}: no cell has that; choose from: {choices}")
 
 
 def size_of(path: Path) -> int | None:

@@ -32,7 +32,7 @@ import msgspec
 
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.mixture.paths import trimmed_folder
-from xrgs.runtime import lease, processes
+from xrgs.runtime import lease, machine
 from xrgs.runtime.machine import gpus, set_huge_pages, set_portable_blas
 from xrgs.runtime.progress import log_line
 from xrgs.runtime.signals import StopRequest, StopSignal, end_by_sigterm
@@ -427,7 +427,7 @@ def _watch(
     while child.poll() is None:
         if minutes and time.monotonic() - start > 60 * minutes:
             return f"it took longer than limits.minutes={minutes:g} and was ended"
-        if memory_gb and (used := processes.resident_bytes(child.pid) / 1e9) > memory_gb:
+        if memory_gb and (used := machine.resident_bytes(child.pid) / 1e9) > memory_gb:
             return (
                 f"out of memory: it used {used:.2f} GB, more than limits.memory_gb={memory_gb:g},"
                 " and was ended"
@@ -549,7 +549,7 @@ def main(work: str, request: str, answer: str) -> None:
     guard_streams()
     faulthandler.enable()
     follow_parent()
-    processes.offer_to_oom_killer()
+    machine.offer_to_oom_killer()
     given: dict[str, Any] = {}
     try:
         given = read_struct(Path(request), dict[str, Any])

@@ -45,10 +45,9 @@ from xrgs.safeio.sanitize import counted, for_line
 from xrgs.splat.backend import resolve_backend
 from xrgs.store.attempts import plan_cell
 from xrgs.store.store import Store, StoreGoneError
-from xrgs.sweep import controls, launchers, track
+from xrgs.sweep import launchers, track
 from xrgs.sweep import plan as plans
 from xrgs.sweep.axes import CellSpec, effective, expand
-from xrgs.sweep.ending import ending
 from xrgs.sweep.estimate import CostEstimator
 from xrgs.sweep.job import (
     FAIL_FAST,
@@ -62,6 +61,7 @@ from xrgs.sweep.job import (
 from xrgs.sweep.monitor import SweepMonitor
 from xrgs.sweep.plan import PlannedCell
 from xrgs.sweep.session import SweepSession
+from xrgs.sweep.status import ending
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -152,7 +152,7 @@ class Study:
         plan = plans.estimated(plan, past, capacity.threads(len(plan), machine) or machine)
         if not self._brief:
             say(plans.describe(plan), sys.stderr)
-            remarks = (*controls.mixed_prune_rules(plan), *plans.unchanged(plan))
+            remarks = (*plans.mixed_prune_rules(plan), *plans.unchanged(plan))
             use = plans.expected_use(plan, past.known)
             for line in filter(None, (*remarks, plans.without_kernels(plan), use)):
                 log_line(line)
@@ -224,10 +224,10 @@ class Study:
             cell = plans.planned(spec, self._compose(spec))
             if cell.reference is not None:
                 reference = plans.planned(cell.reference, self._compose(cell.reference))
-                controls.check_reference(cell, reference)
+                plans.check_reference(cell, reference)
                 plan.setdefault(cell.reference, reference)
             plan.setdefault(cell.spec, cell)
-        controls.check_effect(combinations, plan.values())
+        plans.check_effect(combinations, plan.values())
         scenes.check_labels(cell.conf.scene for cell in plan.values())
         return plans.with_wanted_baselines(list(plan.values()))
 

@@ -13,17 +13,21 @@ import math
 import threading
 from collections import deque
 from contextlib import ExitStack, contextmanager, redirect_stdout
+from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
+from numpy.typing import NDArray
 
 from xrgs.errors import XrgsError
 from xrgs.safeio.sanitize import for_markdown
-from xrgs.store.contact_sheet import COLOURS
+from xrgs.splat.quaternions import rotation_matrices
+from xrgs.splat.sh import sh_to_colors
+from xrgs.store.inspect import COLOURS
 from xrgs.viewer.models import reference
 from xrgs.viewer.paths import look_at_point, up_direction
-from xrgs.viewer.splats import to_splats
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -31,6 +35,7 @@ if TYPE_CHECKING:
     from viser import CameraHandle, ClientHandle, ViserServer
 
     from xrgs.splat.cameras import Camera
+    from xrgs.splat.gaussians import Gaussians
     from xrgs.viewer.models import Model
 
     _Pose = dict[str, Any]  # by the names of _POSE
@@ -75,7 +80,7 @@ def shown(models: Sequence[Model], port: int, limit: int) -> Iterator[str]:
         models: One model, or several of one world.
         port: The port of the page; viser's servers take the next free ones. 0 lets the system
             choose all of them.
-        limit: The most Gaussians of a model that are drawn, see `xrgs.viewer.splats.to_splats`.
+        limit: The most Gaussians of a model that are drawn, see `xrgs.viewer.live.to_splats`.
 
     Yields:
         The address of the page.
@@ -296,3 +301,37 @@ def _same(first: _Pose, second: _Pose) -> bool:
     """Return whether two poses differ at most by the browser's rounding."""
     near = _ROUNDING * np.linalg.norm(np.subtract(first["position"], first["look_at"]))
     return all(np.allclose(first[name], second[name], rtol=0, atol=near) for name in _POSE)
+
+
+Array = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Splats:
+    """N Gaussians without harmonics above band 0, in the order of the model."""
+
+    centers: Array
+    """[N, 3] world units."""
+    covariances: Array
+    """[N, 3, 3] world units squared."""
+    colors: Array
+    """[N, 3] in 0..1."""
+    opacities: Array
+    """[N] in 0..1."""
+
+
+@torch.no_grad()
+def to_splats(gaussians: Gaussians, limit: int) -> Splats:
+    """Convert the `limit` most opaque Gaussians of a model; of equal ones, the first are taken."""
+    kept = gaussians.opacities.argsort(descending=True, stable=True)[:limit].sort().values
+    rotations, scales = rotation_matrices(gaussians.quats[kept]), gaussians.scales[kept].exp()
+    factor = rotations * scales[:, None, :]  # [N, 3, 3], each axis times its length
+    means, sh0 = gaussians.means[kept], gaussians.sh0[kept]
+    any_direction = torch.zeros_like(means)
+    arrays = (
+        means,
+        factor @ factor.transpose(1, 2),
+        sh_to_colors(0, any_direction, sh0, gaussians.shN[kept]).clamp(0, 1),
+        gaussians.opacities[kept].sigmoid(),
+    )
+    return Splats(*(array.numpy() for array in arrays))

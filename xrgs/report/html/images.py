@@ -31,9 +31,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from xrgs.mixture.views import Variant
+    from xrgs.report.collect import ReportStore
     from xrgs.report.compare import Comparison
     from xrgs.report.html.content import Content
-    from xrgs.report.joined import ReportStore
     from xrgs.viewer.trained import TrainedScene
 
 #: The largest longer side of an image on the page, px.
