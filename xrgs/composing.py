@@ -26,13 +26,12 @@ from xrgs.splat.backend import CHOICES
 from xrgs.splat.settings import NOMINAL_STEPS, SPLITS, STARTS, STRATEGIES
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator, Mapping
     from pathlib import Path
     from types import ModuleType
 
     from omegaconf import DictConfig
 
-    from xrgs.splat.settings import OptimizerSettings
 
 #: The start of an interpolation and the backslashes before it; an odd number escapes it.
 _INTERPOLATION = re.compile(r"(\\*)\$\{")
@@ -40,7 +39,6 @@ _INTERPOLATION = re.compile(r"(\\*)\$\{")
 _AT = re.compile(r" - at `\$\.?(.*)`$")
 #: Placeholder in `conf/config.yaml` for a value that the files of `conf/scene/` set.
 _OPEN = "???"
-_RETRY = ("none", "failed")
 _HYDRA_LOCK = threading.Lock()
 
 
@@ -108,91 +106,92 @@ def to_conf(cfg: DictConfig) -> Conf:
         return OmegaConf.to_container(value, resolve=True, throw_on_missing=True)
 
     values = {name: plain(name) for name in map(str, cfg) if name != "hydra"}
-    _check_integers(values)
+    for key, value in dotted(values):
+        if isinstance(value, int) and not -(2**63) <= value < 2**63:  # torch can't hold it
+            raise XrgsError(f"{key}={value}: must be below 2^63 = {2**63}")
     conf = from_dict(values)
-    _expand_home(conf)
-    _check_ranges(conf)
-    _check_optimizer(conf.splat.optimizer)
-    _check_choices(conf)
-    _check_strategy(conf)
-    return conf
-
-
-def _expand_home(conf: Conf) -> None:
-    """Replace `~` by the user's home folder in every path."""
     for key in PATHS:
         *groups, name = key.split(".")
         group = reduce(getattr, groups, conf)
         path = getattr(group, name)
         if path is not None and path.startswith("~"):
             setattr(group, name, str(user_path(path)))
+    _check(conf)
+    _check_strategy(conf)
+    return conf
 
 
-def _check_integers(values: dict[str, Any], path: str = "") -> None:
-    """Raise `XrgsError` for an integer that torch can't hold; the message names its key."""
+def dotted(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the values of nested dicts with their dotted keys, as `splat.densify.every`."""
     for name, value in values.items():
         if isinstance(value, dict):
-            _check_integers(value, f"{path}{name}.")
-        elif isinstance(value, int) and not -(2**63) <= value < 2**63:
-            raise XrgsError(f"{path}{name}={value}: must be below 2^63 = {2**63}")
+            yield from dotted(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
 
 
-def _check_ranges(conf: Conf) -> None:
-    """Raise `XrgsError` for a number out of range; the message names its key."""
-    least_values = (
-        ("splat.optimizer.shN_every", conf.splat.optimizer.shN_every, 1),
-        ("seed", conf.seed, 0),
-        ("variant.seed", conf.variant.seed, 0),
-        ("variant.sfm.seed", conf.variant.sfm.seed, 0),
-        ("train.steps", conf.train.steps, 1),
-        ("train.evaluate_every", conf.train.evaluate_every, 0),
-        ("threads", conf.threads, 0),
-        ("checkpoint_s", conf.checkpoint_s, 0),
-        ("limits.minutes", conf.limits.minutes, 0),
-        ("limits.memory_gb", conf.limits.memory_gb, 0),
-    )
-    for key, value, least in least_values:
-        if not value >= least:
-            raise XrgsError(f"{key}={value}: must be at least {least}")
-    if (seed := conf.variant.sfm.seed) >= 2**31:
-        raise XrgsError(
-            f"variant.sfm.seed={seed}: must be below 2^31 = {2**31}, as COLMAP holds it"
-        )
-    for name in ("validation", "hr_share"):
-        if not 0 <= (share := getattr(conf.train, name)) < 1:
-            raise XrgsError(f"train.{name}={share}: must be from 0 to below 1")
-    if not (math.isfinite(scale := conf.splat.init_scale) and scale > 0):
-        raise XrgsError(f"splat.init_scale={scale}: must be finite and above 0")
-    for name in ("budget", "noise"):
-        value = getattr(conf.splat.densify, name)
-        if not (math.isfinite(value) and value >= 0):
-            raise XrgsError(f"splat.densify.{name}={value}: must be a finite number, 0 or more")
+#: Keys, whether a value of theirs is valid, and the rule that a message gives.
+_RULES: tuple[tuple[tuple[str, ...], Callable[[Any], bool], str], ...] = (
+    (("splat.optimizer.shN_every", "train.steps"), lambda value: value >= 1, "at least 1"),
+    (
+        (
+            *("seed", "variant.seed", "variant.sfm.seed", "train.evaluate_every", "threads"),
+            *("checkpoint_s", "limits.minutes", "limits.memory_gb"),
+        ),
+        lambda value: value >= 0,
+        "at least 0",
+    ),
+    (
+        ("variant.sfm.seed",),
+        lambda value: value < 2**31,
+        f"below 2^31 = {2**31}, as COLMAP holds it",
+    ),
+    (
+        ("train.validation", "train.hr_share"),
+        lambda value: 0 <= value < 1,
+        "from 0 to below 1",
+    ),
+    (
+        ("splat.init_scale",),
+        lambda value: math.isfinite(value) and value > 0,
+        "finite and above 0",
+    ),
+    (
+        ("splat.densify.budget", "splat.densify.noise"),
+        lambda value: math.isfinite(value) and value >= 0,
+        "a finite number, 0 or more",
+    ),
+    (
+        ("splat.optimizer.means_decay_from", "splat.optimizer.length_decay_from"),
+        lambda value: 0 <= value < NOMINAL_STEPS,
+        f"0 or more and below {NOMINAL_STEPS}, the length of a run",
+    ),
+    (("splat.optimizer.length_power",), lambda value: 0 <= value <= 1, "from 0 to 1"),
+)
+#: Keys of names -> their choices.
+_CHOICES = {
+    "train.views": TRAINING_VIEWS,
+    "splat.backend": CHOICES,
+    "splat.strategy": STRATEGIES,
+    "splat.init": STARTS,
+    "splat.densify.split": SPLITS,
+    "retry": ("none", "failed"),
+}
 
 
-def _check_optimizer(optimizer: OptimizerSettings) -> None:
-    """Raise `XrgsError` for settings of the learning rates out of range."""
-    for name in ("means_decay_from", "length_decay_from"):
-        if not 0 <= (begin := getattr(optimizer, name)) < NOMINAL_STEPS:
-            raise XrgsError(
-                f"splat.optimizer.{name}={begin}: must be 0 or more and below {NOMINAL_STEPS}, the"
-                " length of a run"
-            )
-    if not 0 <= (power := optimizer.length_power) <= 1:
-        raise XrgsError(f"splat.optimizer.length_power={power}: must be from 0 to 1")
+def _value(conf: Conf, key: str) -> Any:
+    return reduce(getattr, key.split("."), conf)
 
 
-def _check_choices(conf: Conf) -> None:
-    """Raise `XrgsError` for a value that is not among the choices of its key."""
-    for key, value, accepted in (
-        ("train.views", conf.train.views, TRAINING_VIEWS),
-        ("splat.backend", conf.splat.backend, CHOICES),
-        ("splat.strategy", conf.splat.strategy, STRATEGIES),
-        ("splat.init", conf.splat.init, STARTS),
-        ("splat.densify.split", conf.splat.densify.split, SPLITS),
-        ("retry", conf.retry, _RETRY),
-    ):
-        if value not in accepted:
-            raise XrgsError(f"{key}={value}: must be one of {', '.join(accepted)}")
+def _check(conf: Conf) -> None:
+    """Raise `XrgsError` for a value that breaks a rule; the message names its key."""
+    for keys, is_valid, rule in _RULES:
+        for key in keys:
+            if not is_valid(value := _value(conf, key)):
+                raise XrgsError(f"{key}={value}: must be {rule}")
+    for key, choices in _CHOICES.items():
+        if (value := _value(conf, key)) not in choices:
+            raise XrgsError(f"{key}={value}: must be one of {', '.join(choices)}")
 
 
 def _check_strategy(conf: Conf) -> None:
@@ -204,21 +203,18 @@ def _check_strategy(conf: Conf) -> None:
                 f"splat.densify.noise={densify.noise}: must be 0 with splat.strategy=default, which"
                 " adds no noise"
             )
-        return
-    if densify.budget == 0:
+    elif densify.budget == 0:
         raise XrgsError(
             "splat.densify.budget=0: must be above 0 with splat.strategy=mcmc, which adds Gaussians"
             " up to it; +ablation=mcmc has a budget"
         )
-    for key, value, accepted in (
-        ("splat.densify.split", densify.split, "random"),
-        ("splat.raster.absgrad", conf.splat.raster.absgrad, False),
-    ):
-        if value != accepted:
-            raise XrgsError(
-                f"{key}={value}: must be {accepted} with splat.strategy=mcmc, which splits nothing"
-                " and reads no image-plane gradient"
-            )
+    else:
+        for key, accepted in (("splat.densify.split", "random"), ("splat.raster.absgrad", False)):
+            if (value := _value(conf, key)) != accepted:
+                raise XrgsError(
+                    f"{key}={value}: must be {accepted} with splat.strategy=mcmc, which splits"
+                    " nothing and reads no image-plane gradient"
+                )
 
 
 #: Former group of `components`, now a plugin of the same name -> the key that switched it on, and

@@ -32,7 +32,7 @@ def handed_over(
         found = train._Placed("0123-4567", mixture, SfmReport())
         monkeypatch.setattr(train, "_place", lambda _: found)
         monkeypatch.setattr(train, "_measured_unit", lambda _: 1e-7)
-        monkeypatch.setattr(train, "_units_of_a_step", lambda *_: 1e5)
+        monkeypatch.setattr("xrgs.sweep.estimate.units_of_a_step", lambda *_: 1e5)
         monkeypatch.setattr(train, "_trial", lambda *_: Trial(start_s=0.0, step_s=0.01))
         monkeypatch.setattr(train, "_say_end", lambda *_: None)
         monkeypatch.setattr(train, "_cell", lambda *_: CellFolder(Path("absent")))

@@ -178,8 +178,8 @@ def _place(words: _Words) -> _Placed | None:
     Raises:
         XrgsError: There are too few photographs, or too few are placed.
     """
-    from xrgs.report.collect import ReportStore
-    from xrgs.store.inspect import mixture
+    from xrgs.store.inspect import mixture, read_report
+    from xrgs.store.trimming import home_of
     from xrgs.sweep import build_variants
     from xrgs.sweep.estimate import read_views
 
@@ -201,7 +201,7 @@ def _place(words: _Words) -> _Placed | None:
     if planned.id is None:
         _say("without --dry-run, their cameras are found, and a recipe is chosen for them")
         return None
-    report = ReportStore(store.path).variant_report(planned.id)
+    report = read_report(home_of(store.variants, planned.id))
     mix = mixture(read_views(store.variants, planned.id))
     _say(f"{name}: the cameras of {report.registered} of {report.images} {kind}s are found")
     _say(
@@ -250,7 +250,7 @@ def _choose_steps(words: _Words, settings: Settings, step_s: float, left_s: floa
 
 def _expected_s(placed: _Placed, conf: Conf, trial: Trial | None) -> float:
     """Return the expected seconds of a training, by the trial, finished cells or a measurement."""
-    from xrgs.sweep.estimate import CostEstimator
+    from xrgs.sweep.estimate import CostEstimator, units_of_a_step
 
     if trial is not None:
         return trial.start_s + conf.train.steps * trial.step_s
@@ -258,13 +258,8 @@ def _expected_s(placed: _Placed, conf: Conf, trial: Trial | None) -> float:
     cost = CostEstimator(Store(conf.store)).cost(conf, placed.variant_id, threads)
     if cost is not None:
         return cost.seconds
-    return conf.train.steps * _measured_unit(conf) * _units_of_a_step(placed, conf)
-
-
-def _units_of_a_step(placed: _Placed, conf: Conf) -> float:
-    from xrgs.sweep.estimate import units_of_a_step
-
-    return units_of_a_step(Store(conf.store), conf, placed.variant_id)
+    units = units_of_a_step(Store(conf.store), conf, placed.variant_id)
+    return conf.train.steps * _measured_unit(conf) * units
 
 
 def _say_end(placed: _Placed, conf: Conf, settings: Settings, seconds: float) -> None:

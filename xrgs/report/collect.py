@@ -9,19 +9,19 @@ import math
 from dataclasses import dataclass, field
 from functools import cache
 from statistics import fmean
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
 import pandas as pd
 
+from xrgs.composing import dotted
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.evaluation.metrics import METRICS, ON_REQUEST, VIEW_METRICS
-from xrgs.mixture.paths import trimmed_folder
 from xrgs.runtime.progress import progress
 from xrgs.safeio.sanitize import for_file_name, for_line
 from xrgs.store.cell_folder import CellState, number_columns
-from xrgs.store.inspect import read_report
 from xrgs.store.provenance import machine
 from xrgs.store.results import over_views
 from xrgs.store.scoring import PROTOCOL, stale_scores, without_refactorings
@@ -38,15 +38,8 @@ if TYPE_CHECKING:
 
 #: The columns of a sweep's record, which has a row for each planned cell.
 RECORD_KEYS = [
-    "scene",
-    "condition",
-    "label",
-    "variant_seed",
-    "seed",
-    "cell_id",
-    "variant_id",
-    "baseline_id",
-    "error",
+    *("scene", "condition", "label", "variant_seed", "seed"),
+    *("cell_id", "variant_id", "baseline_id", "error"),
 ]
 #: The columns that name a cell in tables of training and curves.
 CELL_KEYS = ["cell_id", "scene", "label", "condition", "variant_seed", "seed"]
@@ -127,8 +120,9 @@ class Sweep:
         """Provenance of the done cells: the distinct values of each entry, sorted."""
         distinct: dict[str, set[str]] = {}
         for cell in self.done.values():
-            for key, value in _provenance_entries(cell.provenance):
-                distinct.setdefault(key, set()).add(value)
+            for key, value in dotted(msgspec.structs.asdict(cell.provenance)):
+                if key != "started":
+                    distinct.setdefault(key, set()).add(str(value))
         return {key: sorted(values) for key, values in sorted(distinct.items())}
 
 
@@ -265,10 +259,10 @@ def _done_columns(cell_id: str, cell: DoneCell) -> dict[str, Any]:
 
 
 @cache
-def _scored(*digests: tuple[str, str]) -> tuple[dict[str, str], str]:
+def _scored(*digests: tuple[str, str]) -> tuple[Mapping[str, str], str]:
     """Return the digests of scores without refactorings, and the names of the stale scores."""
     scored_by = without_refactorings(dict(digests))
-    return scored_by, " ".join(stale_scores(scored_by))
+    return MappingProxyType(scored_by), " ".join(stale_scores(scored_by))
 
 
 def _views(done: Mapping[str, DoneCell]) -> pd.DataFrame:
@@ -290,7 +284,7 @@ def _cells(
     numbers = ["validation", "steps", "long_side", "factor", *(metric.name for metric in METRICS)]
     entries = [
         {key: getattr(row, key) for key in RECORD_KEYS}
-        | (columns[row.cell_id] if row.cell_id is not None else _without_cell(row))
+        | (columns[row.cell_id] if row.cell_id else _without_cell(row))
         for row in rows
     ]
     cells = pd.DataFrame(entries, columns=[*RECORD_KEYS, *texts, *numbers])
@@ -325,15 +319,6 @@ def _check_identity(
                     f"sweeps/{sweep_id}.json says {key} {recorded} of cell {row.cell_id}, "
                     f"its identity.json says {actual}"
                 )
-
-
-def _provenance_entries(provenance: Provenance) -> Iterable[tuple[str, str]]:
-    """Yield the entries of a cell's provenance, without the time of its start."""
-    for key, value in msgspec.structs.asdict(provenance).items():
-        if isinstance(value, dict):
-            yield from ((f"{key}.{name}", str(inner)) for name, inner in value.items())
-        elif key != "started":
-            yield key, str(value)
 
 
 #: The most ids in the name of a report's folder.
@@ -388,15 +373,6 @@ class ReportStore(Store):
         super().__init__(path)
         self.external: Mapping[str, Path] = {}
         """Folders of another program's renders, see `Sweep.renders`."""
-
-    def variant_report(self, variant_id: str) -> SfmReport:
-        """Read the SfM report of a variant, even if its images were trimmed.
-
-        Raises:
-            StoreError: The store lacks the variant, or its report is damaged or can't be read now.
-        """
-        trimmed = trimmed_folder(self.variants, variant_id)
-        return read_report(trimmed if trimmed.is_dir() else self.variant(variant_id))
 
     def render(self, cell_id: str, view: str) -> Path:
         """Return the file of the render of a view, whether or not it exists.

@@ -1,7 +1,4 @@
-"""The context of a table: how its cells were trained and scored, and cautions.
-
-Tables show it in all formats: text, Markdown, LaTeX and HTML.
-"""
+"""The context of a table: how its cells were trained and scored, cautions, and photographs."""
 
 from __future__ import annotations
 
@@ -17,10 +14,11 @@ from xrgs.report.inference import OTHER_CODE
 from xrgs.report.writing import signed
 from xrgs.runtime.text import listed
 from xrgs.safeio.sanitize import counted, for_line
-from xrgs.store.inspect import SfmReport
+from xrgs.store.inspect import SfmReport, read_report
+from xrgs.store.trimming import home_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from xrgs.config import Conf, VariantConf
     from xrgs.report.collect import ReportStore, Sweep
@@ -62,11 +60,6 @@ class Context:
         return "; ".join((*self.training, *self.machine))
 
 
-def context_of(contexts: Mapping[str, Context], condition: str) -> Context:
-    """Return the context of a condition; an empty one if none is known."""
-    return contexts.get(condition, Context())
-
-
 def contexts(sweep: Sweep) -> dict[str, Context]:
     """Return the context of each condition; an empty one without finished cells."""
     cells = sweep.cells
@@ -82,11 +75,13 @@ def contexts(sweep: Sweep) -> dict[str, Context]:
         configs = [cell.config for cell in trained]
         reports = [sweep.variants.get(name) for name in rows["variant_id"]]
         tagged = not all(report and report.alike for report in reports)
-        held_out = bool((rows["validation"] > 0).any())
+        least, most = min(tests.values()), max(tests.values())
+        count = f"{least}" if least == most else f"{least} to {most}"
+        kind = "held-out training view" if (rows["validation"] > 0).any() else "test view"
         by_condition[str(condition)] = Context(
             (
                 *_sizes([config for config in configs if config], tagged=tagged),
-                _scored_views(tests, held_out=held_out),
+                f"{count} {kind}{'s' * (most != 1)}{' a scene' * (len(tests) > 1)}",
                 *_prune_rule(zip(rows["label"], configs, strict=True)),
             ),
             _machine([cell.provenance for cell in trained]),
@@ -123,13 +118,6 @@ def _sizes(configs: Sequence[Conf], *, tagged: bool) -> list[str]:
         "HR views at the photographs' size" if sizes == "0" else f"HR views of at most {sizes} px",
         " or ".join(dict.fromkeys(_mixture(config.variant) for config in configs)),
     ]
-
-
-def _scored_views(tests: Mapping[str, int], *, held_out: bool) -> str:
-    least, most = min(tests.values()), max(tests.values())
-    count = f"{least}" if least == most else f"{least} to {most}"
-    kind = "held-out training view" if held_out else "test view"
-    return f"{count} {kind}{'s' * (most != 1)}{' a scene' * (len(tests) > 1)}"
 
 
 def _mixture(variant: VariantConf) -> str:
@@ -314,7 +302,7 @@ def with_variants(sweep: Sweep, store: ReportStore) -> Sweep:
     reports = {}
     for variant_id in done["variant_id"].unique():
         try:
-            reports[variant_id] = store.variant_report(variant_id)
+            reports[variant_id] = read_report(home_of(store.variants, variant_id))
         except StoreError as error:
             why = store.without_paths(str(error))
             reports[variant_id] = SfmReport(notes=(f"unknown what was done with them: {why}",))
@@ -332,7 +320,12 @@ def photographs(sweep: Sweep) -> list[tuple[str, tuple[str, ...]]]:
     for scene, rows in done.groupby("scene", sort=False):
         variants = [sweep.variants[name] for name in rows["variant_id"].unique()]
         notes = [note for variant in variants for note in variant.all_notes(_MAX_NAMES)]
-        by_scene.append((str(scene), tuple(dict.fromkeys([*notes, *_findings(sweep, rows)]))))
+        several = len(rows[["variant_seed", "seed"]].drop_duplicates()) > 1
+        for row in rows[rows["cell_id"].isin(sweep.done)].to_dict("records"):
+            replicate = f"replicate {row['variant_seed']}/{row['seed']}" * several
+            name = ", ".join(filter(None, (row["label"], row["condition"], replicate)))
+            notes += [f"{name}: {line}" for line in sweep.done[row["cell_id"]].summary.found]
+        by_scene.append((str(scene), tuple(dict.fromkeys(notes))))
     return [(scene, notes) for scene, notes in by_scene if notes]
 
 
@@ -349,12 +342,3 @@ def placement(sweep: Sweep, scene: str) -> str:
     parts += [f"{report.points:,} points"] if report.points else []
     parts += [] if error is None else [f"mean reprojection error {error:.2f} px"]
     return ", ".join(parts)
-
-
-def _findings(sweep: Sweep, rows: pd.DataFrame) -> Iterator[str]:
-    """Yield the findings of a scene's trainings, each with its label and replicate."""
-    replicates = len(rows[["variant_seed", "seed"]].drop_duplicates())
-    for row in rows[rows["cell_id"].isin(sweep.done)].to_dict("records"):
-        replicate = f"replicate {row['variant_seed']}/{row['seed']}" * (replicates > 1)
-        name = ", ".join(filter(None, (row["label"], row["condition"], replicate)))
-        yield from (f"{name}: {line}" for line in sweep.done[row["cell_id"]].summary.found)

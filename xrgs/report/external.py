@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from collections.abc import Hashable, Mapping, Sequence
     from pathlib import Path
 
-    from xrgs.mixture.views import View
     from xrgs.report.collect import ReportStore
 
 #: Another program's renders become one row for each combination of these columns.
@@ -134,7 +133,16 @@ def _with_program(sweep: Sweep, store: ReportStore, program: External) -> Sweep:
         expected = {view.name: view for view in variant_views if view.split == split}
         bar = progress(list(views), f"scoring {program.label}", "view")
         masked = any(expected[name].mask for name in views)
-        scores += [{"cell_id": cell_id} | _score(folder, expected[name], masked) for name in bar]
+        for name in bar:
+            view, file = expected[name], folder / f"{name}.png"
+            try:
+                scored = score_file(file, view, masked=masked)
+            except ImageError as error:
+                wanted = f"an 8-bit RGB PNG of {view.width} x {view.height} px"
+                raise ReportError(
+                    f"{error}; expected is {wanted}, the render of the view {name}"
+                ) from error
+            scores.append({"cell_id": cell_id, "view": name} | scored)
         renders[cell_id] = folder
         file = folder / FIGURES
         figures = read_struct(file, Figures) if file.exists() else Figures()
@@ -180,13 +188,3 @@ def _folder(program: External, cell: Mapping[Hashable, Any], done: pd.DataFrame)
             f"{expected} is expected, with <view>.png for each view that is scored"
         )
     return existing[0]
-
-
-def _score(folder: Path, view: View, masked: bool) -> dict[str, Any]:
-    """Score the render of a view against its photograph."""
-    file = folder / f"{view.name}.png"
-    wanted = f"expected is an 8-bit RGB PNG of {view.width} x {view.height} px, the render of the"
-    try:
-        return {"view": view.name} | score_file(file, view, masked=masked)
-    except ImageError as error:
-        raise ReportError(f"{error}; {wanted} view {view.name}") from error

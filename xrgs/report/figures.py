@@ -301,7 +301,11 @@ def dependence(title: str, key: str, changes: pd.DataFrame, axes: Sequence[Metri
             _dependence_line(panel, rows[rows["series"] == name], look)
             for name, look in zip(series, _ARMS[1:], strict=False)
         ]
-        _scaled(panel, sorted(rows["value"].unique()))
+        values = sorted(rows["value"].unique())
+        if values[0] > 0 and values[-1] >= _LOG_FROM * values[0]:
+            panel.set_xscale("log")
+            panel.xaxis.set_minor_locator(NullLocator())
+        panel.set_xticks(values, [f"{value:g}" for value in values])
         panel.axhline(0, color=_BASELINE, linewidth=1.3, linestyle="--")
         panel.set_title(named(metric), fontsize=10)
         panel.set_xlabel(for_line(key, _MAX_NAME))
@@ -325,14 +329,6 @@ def _dependence_line(axis: Axes, rows: pd.DataFrame, look: tuple[str, str]) -> L
         axis.plot(curve["value"], curve["change"], color=color, linewidth=0.7, alpha=0.45)
     mean = of["mean"]
     return axis.plot(mean["value"], mean["change"], color=color, marker=mark, linewidth=1.8)[0]
-
-
-def _scaled(axis: Axes, values: Sequence[float]) -> None:
-    """Mark the values of a setting on its axis, see `_LOG_FROM`."""
-    if values[0] > 0 and values[-1] >= _LOG_FROM * values[0]:
-        axis.set_xscale("log")
-        axis.xaxis.set_minor_locator(NullLocator())
-    axis.set_xticks(values, [f"{value:g}" for value in values])
 
 
 def _with_grid(axis: Axes) -> None:

@@ -12,7 +12,7 @@ import pandas as pd
 from xrgs.errors import StoreError
 from xrgs.report.averages import averaged
 from xrgs.report.compare import is_ratio
-from xrgs.report.context import context_of
+from xrgs.report.context import Context
 from xrgs.report.inference import MIN_VALUES, log_ratio
 from xrgs.report.markup import filled, titled
 from xrgs.report.writing import (
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from xrgs.evaluation.metrics import Metric
     from xrgs.report.collect import ReportStore
     from xrgs.report.compare import Comparison
-    from xrgs.report.context import Context
     from xrgs.report.writing import Change
 
 #: Labels of the full XR-GS; each reads section 5.4 of the paper in another way.
@@ -127,11 +126,18 @@ def paper_tables(comparison: Comparison, contexts: Mapping[str, Context]) -> lis
     labels = {label for label, _ in comparison.groups}
     if comparison.base != BASELINE or labels.isdisjoint(_READINGS):
         return []
-    names = [metric.name for metric in comparison.metrics]
-    per_scene, means = map(by_key, averaged(_as_ratios(comparison), names))
+    # log(value / base) is the effect of PSNR too: the paper has percent.
+    pairs, names = comparison.pairs, [metric.name for metric in comparison.metrics]
+    in_db = [metric.name for metric in comparison.metrics if not is_ratio(metric)]
+    rows = pairs["metric"].isin(in_db) & pairs["effect"].notna()
+    effect, why = log_ratio(*(pairs[name].to_numpy(np.float64) for name in ("base", "value")))
+    pairs = pairs.assign(
+        effect=np.where(rows, effect, pairs["effect"]), why=np.where(rows, why, pairs["why"])
+    )
+    per_scene, means = map(by_key, averaged(pairs, names))
     tables = []
     for condition in dict.fromkeys(condition for _, condition in comparison.groups):
-        context = context_of(contexts, condition).of_all
+        context = contexts.get(condition, Context()).of_all
         if _LLFF.issuperset(comparison.scenes):
             tables.append(_beside(comparison, condition, _TABLE_1, means, "", context))
         for column in _TABLE_2:
@@ -143,17 +149,6 @@ def paper_tables(comparison: Comparison, contexts: Mapping[str, Context]) -> lis
                 }
                 tables.append(_beside(comparison, condition, column, here, scene, context))
     return [table for table in tables if table.rows]
-
-
-def _as_ratios(comparison: Comparison) -> pd.DataFrame:
-    """Return the pairs with log(value / base) as the effect of PSNR too: the paper has percent."""
-    pairs = comparison.pairs
-    in_db = {metric.name for metric in comparison.metrics if not is_ratio(metric)}
-    rows = pairs["metric"].isin(in_db) & pairs["effect"].notna()
-    effect, why = log_ratio(*(pairs[name].to_numpy(np.float64) for name in ("base", "value")))
-    return pairs.assign(
-        effect=np.where(rows, effect, pairs["effect"]), why=np.where(rows, why, pairs["why"])
-    )
 
 
 def _beside(
@@ -290,7 +285,7 @@ def _by_texture(
             "rank correlation: Spearman's, of texture and change over the scenes; it describes"
             " these scenes, and so few are no test",
         ),
-        context=context_of(contexts, condition).of_scores,
+        context=contexts.get(condition, Context()).of_scores,
     )
 
 

@@ -103,8 +103,11 @@ def draw(
     cells = comparison.cells.drop_duplicates("cell_id").set_index("cell_id")
     drawings = _curves_of_quality(comparison, quality)
     drawings |= _trade_offs(comparison) | _sensitivities(comparison)
+    none = pd.Series(dtype=float)
     for _, pair in pairs.iterrows():
-        both = _same_views(psnr.get(pair["base_id"]), psnr.get(pair["cell_id"]))
+        base, ablation = psnr.get(pair["base_id"], none), psnr.get(pair["cell_id"], none)
+        shared = ablation.index[ablation.index.isin(base.index)]
+        both = base[shared], ablation[shared]
         cell = cells.loc[pair["cell_id"]]
         split = "train" if cell["validation"] > 0 else "test"
         variant = store.variant(cell["variant_id"])
@@ -112,33 +115,20 @@ def draw(
         drawings[stem] = partial(_views, store, pair, comparison.base, both, variant, split)
         if not store.external.keys() & {pair["base_id"], pair["cell_id"]}:
             drawings[f"{stem}--training"] = partial(_training, store, pair, comparison.base)
-    first_ones = dict(islice(drawings.items(), _MAX_PICTURES))
-    chosen = first_ones if names is None else _chosen(drawings, names)
+    if unknown := [name for name in names or () if name not in drawings]:
+        choices = ", ".join(drawings) or "none"
+        raise ReportError(
+            f"pictures={unknown[0]}: there is no picture of that name; choose from: {choices}"
+        )
+    chosen = {name: drawing for name, drawing in drawings.items() if name in (names or ())}
+    if names is None:
+        chosen = dict(islice(drawings.items(), _MAX_PICTURES))
     bar = progress(chosen.items(), "drawing", "picture", len(chosen))
     drawn = [drawing(folder / f"{name}.png") for name, drawing in bar]
     if names is None and len(chosen) < len(drawings):
         why = f"only the first {len(chosen)} are drawn; --pictures NAMES draws others"
         drawn.append(Picture(f"{len(drawings) - len(chosen)} more", None, why))
     return drawn
-
-
-def _same_views(base: pd.Series | None, ablation: pd.Series | None) -> tuple[pd.Series, pd.Series]:
-    """Return the PSNR of both cells, dB, for the views that both have; empty if there is none."""
-    if base is None or ablation is None:
-        return pd.Series(dtype=float), pd.Series(dtype=float)
-    both = ablation.index[ablation.index.isin(base.index)]
-    return base[both], ablation[both]
-
-
-def _chosen(drawings: dict[str, _Drawing], names: Sequence[str]) -> dict[str, _Drawing]:
-    """Return the drawings of these names."""
-    for name in names:
-        if name not in drawings:
-            choices = ", ".join(drawings) or "none"
-            raise ReportError(
-                f"pictures={name}: there is no picture of that name; choose from: {choices}"
-            )
-    return {name: drawing for name, drawing in drawings.items() if name in names}
 
 
 def _trade_offs(comparison: Comparison) -> dict[str, _Drawing]:
@@ -178,7 +168,7 @@ def _sensitivities(comparison: Comparison) -> dict[str, _Drawing]:
             drawings[name] = partial(_drawn, title, partial(dependence, title, key, rows, axes))
             if (count := rows["series"].nunique()) >= MAX_ARMS:
                 why = f"{count} curves, and a figure can tell {MAX_ARMS - 1} apart"
-                drawings[name] = partial(_not_drawn, title, why)
+                drawings[name] = lambda _, title=title, why=why: Picture(title, None, why)
     return drawings
 
 
@@ -300,10 +290,6 @@ def _drawn(title: str, figure: Callable[[], bytes], file: Path) -> Picture:
     with atomic_writer(file) as stream:
         stream.write(figure())
     return Picture(title, file)
-
-
-def _not_drawn(title: str, why: str, _: Path) -> Picture:
-    return Picture(title, None, why)
 
 
 def median_view(base: pd.Series, ablation: pd.Series) -> str:

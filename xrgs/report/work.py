@@ -107,7 +107,8 @@ def totals(cells: pd.DataFrame, done: Mapping[str, DoneCell]) -> pd.DataFrame:
 def totals_table(totals: pd.DataFrame, labels: Sequence[str], condition: str) -> TextTable:
     """Return the table of `totals` of one condition, scene by scene, as means over seeds."""
     chosen = totals[totals["condition"] == condition]
-    names = [name for name in _ordered(totals) if chosen[name].notna().any()]
+    numbers = [name for name in totals if name not in CELL_KEYS and chosen[name].notna().any()]
+    names = sorted(numbers, key=lambda name: (name not in _LABELS, is_component_log(name)))
     means = chosen.groupby(["scene", "label"])[names].mean().to_dict("index")
     rows = []
     for scene in sorted(chosen["scene"].unique()):
@@ -126,12 +127,6 @@ def totals_table(totals: pd.DataFrame, labels: Sequence[str], condition: str) ->
         align="ll" + "r" * len(labels),
         notes=("names with a dot: values that a component logged, means over training",),
     )
-
-
-def _ordered(totals: pd.DataFrame) -> list[str]:
-    """Return the columns of numbers: those of `_LABELS`, others, then the components'."""
-    numbers = [name for name in totals.columns if name not in CELL_KEYS]
-    return sorted(numbers, key=lambda name: (name not in _LABELS, is_component_log(name)))
 
 
 def _count(value: float | None, *, is_component_log: bool) -> str:

@@ -211,21 +211,17 @@ def views_table(frozen: Variant, report: SfmReport) -> TextTable:
         rows.append((name, split, "LR" if name in report.lr else "HR", "", "", "no"))
     columns = ("View", "Split", "Tag", "Size, px", "rho", "Placed")
     title = f"{frozen.scene}, variant {frozen.id}, factor {frozen.factor}"
-    notes = tuple(_counts(frozen, tagless=report.tagless))
-    kept = [i for i, name in enumerate(columns) if name != "Tag" or not report.tagless]
-    heads, *cells = (tuple(row[i] for i in kept) for row in (columns, *sorted(rows)))
-    align = "".join("lllrrl"[i] for i in kept)
-    return TextTable(title, heads, tuple(cells), align, notes)
-
-
-def _counts(frozen: Variant, *, tagless: bool) -> Iterator[str]:
     train = [view.tag for view in frozen.views if view.split == "train"]
     tests = sum(view.split == "test" for view in frozen.views)
     kind = "held out" if frozen.held_out else "tests, at the trained poses"
     trained = f"{train.count('HR')} HR and {train.count('LR')} LR"
-    yield f"{len(train) if tagless else trained} to train on, {tests} {kind}"
+    notes = [f"{len(train) if report.tagless else trained} to train on, {tests} {kind}"]
     if originals := sum(view.split == "original" for view in frozen.views):
-        yield f"originals of degraded views kept beside them: {originals}"
+        notes.append(f"originals of degraded views kept beside them: {originals}")
+    kept = [i for i, name in enumerate(columns) if name != "Tag" or not report.tagless]
+    heads, *cells = (tuple(row[i] for i in kept) for row in (columns, *sorted(rows)))
+    align = "".join("lllrrl"[i] for i in kept)
+    return TextTable(title, heads, tuple(cells), align, tuple(notes))
 
 
 class Mixture(NamedTuple):

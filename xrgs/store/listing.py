@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
@@ -136,16 +137,12 @@ def cell_rows(
     rows = []
     for cell in cells:
         state = cell.state(verify=verify, owner=holders.get(cell.id))
+        identity = None
+        with suppress(StoreError):
+            identity = cell.identity()
         sweep_ids = tuple(sweeps.get(cell.id, ()))
-        rows.append(CellRow(cell, state, recorded.get(cell.id), sweep_ids, _identity(cell)))
+        rows.append(CellRow(cell, state, recorded.get(cell.id), sweep_ids, identity))
     return sorted(rows, key=lambda row: (row.scene, row.arm, row.seed or 0, row.id))
-
-
-def _identity(cell: CellFolder) -> Identity | None:
-    try:
-        return cell.identity()
-    except StoreError:
-        return None
 
 
 @dataclass(frozen=True)
@@ -164,18 +161,18 @@ def sweep_rows(
     folder: Path, records: Mapping[str, SweepRecord], cells: Iterable[CellRow]
 ) -> list[SweepRow]:
     """List recorded sweeps, the latest last, whose records are in a folder."""
-    states = {cell.id: cell.state.name for cell in cells}
-
-    def state(row: RecordedCell) -> str:
-        if row.error:
-            return "failed"
-        name = states.get(row.cell_id or "", "absent")
-        return "pending" if name in {"absent", "planned", "unfinished"} else name
-
-    return [
-        SweepRow(i, record, modified(folder / f"{i}.json"), Counter(map(state, record.cells)))
-        for i, record in records.items()
-    ]
+    states: dict[str | None, str] = {
+        cell.id: cell.state.name
+        for cell in cells
+        if cell.state.name not in {"absent", "planned", "unfinished"}
+    }
+    rows = []
+    for name, record in records.items():
+        of_cells = (
+            "failed" if row.error else states.get(row.cell_id, "pending") for row in record.cells
+        )
+        rows.append(SweepRow(name, record, modified(folder / f"{name}.json"), Counter(of_cells)))
+    return rows
 
 
 def modified(file: Path) -> float | None:

@@ -27,15 +27,6 @@ _PACKAGES = ("torch", "numpy", "pycolmap", "kornia", "scikit-image", "hydra-core
 MACHINE_KEYS = ("cpu", "gpu", "instruction_set", "threads", "backend")
 
 
-def _commit() -> Mapping[str, str | None]:
-    """Return `git` and `git_diff_sha256` of the package: of its checkout, or of its build."""
-    package = Path(xrgs.__file__).parent
-    source = commit.of_checkout(package.parent)
-    if source is None and (package / commit.FILE).is_file():
-        source = read_struct(package / commit.FILE, dict[str, str | None])
-    return source or {}
-
-
 def _cpu() -> str:
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
@@ -66,7 +57,10 @@ def collect(threads: int, backend: str) -> Provenance:
             can't be scored is better stopped here than after its training.
         XrgsError: The backend is not available on this machine.
     """
-    built_from = _commit()
+    package = Path(xrgs.__file__).parent
+    built_from = commit.of_checkout(package.parent) or {}
+    if not built_from and (package / commit.FILE).is_file():
+        built_from = read_struct(package / commit.FILE, dict[str, str | None])
     gpu: str | None = None
     if device(backend) == "cuda":
         import torch

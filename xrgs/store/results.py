@@ -10,12 +10,13 @@ import msgspec
 import numpy as np
 import pandas as pd
 
+from xrgs.composing import dotted
 from xrgs.errors import StoreError, XrgsError
 from xrgs.evaluation.metrics import METRICS
 from xrgs.safeio.sanitize import for_line
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Iterable, Mapping
 
     from xrgs.store.cell_folder import CellFolder
     from xrgs.store.schema import RecordedCell, Summary
@@ -51,7 +52,11 @@ def cell_columns(cell: CellFolder, names: RecordedCell | None) -> dict[str, Any]
         config = asdict(cell.config())
     except XrgsError:
         config = {}
-    settings = dict(_flat({name: config[name] for name in _CONFIG_GROUPS if name in config}))
+    groups = {name: config[name] for name in _CONFIG_GROUPS if name in config}
+    settings = {
+        for_line(key): for_line(value) if isinstance(value, str) else value
+        for key, value in dotted(groups)
+    }
     return {
         **settings,
         "cell_id": cell.id,
@@ -61,16 +66,6 @@ def cell_columns(cell: CellFolder, names: RecordedCell | None) -> dict[str, Any]
         "seed": identity.seed if identity else None,
         "variant": identity.variant if identity else None,
     }
-
-
-def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield nested values under dotted names, as `train.steps`."""
-    for name, value in values.items():
-        key = for_line(f"{prefix}{name}")
-        if isinstance(value, dict):
-            yield from _flat(value, f"{key}.")
-        else:
-            yield key, for_line(value) if isinstance(value, str) else value
 
 
 def over_views(views: pd.DataFrame) -> pd.DataFrame:

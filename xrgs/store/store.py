@@ -361,7 +361,9 @@ class Store:
         """
         rows = msgspec.to_builtins(tuple(cells))
         record = SweepRecord(1, tuple(command), tuple(cells), digest(rows))
-        sweep_id = sweep_id or digest([_asked_for(row) for row in rows])
+        if sweep_id is None:  # of what is known before any cell is trained
+            names = ("scene", "label", "condition", "variant_seed", "seed", "variant_id")
+            sweep_id = digest([{n: row[n] for n in (*names, "planned_id")} for row in rows])
         write_json(self.sweeps / f"{sweep_id}.json", msgspec.to_builtins(record))
         return sweep_id
 
@@ -416,9 +418,3 @@ def unchanged_record(file: Path) -> SweepRecord:
 def _name_of(word: str) -> str:
     """Return a word; where it is a folder, the name of the scene in the folder."""
     return scene_name(user_path(word)) if user_path(word).is_dir() else word
-
-
-def _asked_for(row: dict[str, Any]) -> dict[str, Any]:
-    """Return the part of a record's row that is known before any cell is trained."""
-    names = ("scene", "label", "condition", "variant_seed", "seed", "variant_id", "planned_id")
-    return {name: row[name] for name in names}

@@ -17,7 +17,7 @@ from xrgs.errors import XrgsError
 from xrgs.store.store import BASELINE
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Iterable, Sequence
 
     from hydra.core.config_loader import ConfigLoader
     from hydra.core.override_parser.types import Override
@@ -182,12 +182,7 @@ def _range(start: float, stop: float | None = None, step: float = 1) -> ChoiceSw
         raise ValueError(f"this range has {count:.0f} values, {_MOST_VALUES} can be: give a step")
     if isinstance(start, int) and isinstance(stop, int) and isinstance(step, int):
         return ChoiceSweep(list=[*range(start, stop, step)])
-    return ChoiceSweep(list=[*map(float, _steps(*(Decimal(str(number)) for number in numbers)))])
-
-
-def _steps(start: Decimal, stop: Decimal, step: Decimal) -> Iterator[Decimal]:
-    for number in itertools.count():
-        value = start + number * step
-        if (value >= stop) if step > 0 else (value <= stop):
-            return
-        yield value
+    first, end, by = (Decimal(str(number)) for number in numbers)
+    values = (first + number * by for number in itertools.count())
+    inside = itertools.takewhile(lambda value: value < end if by > 0 else value > end, values)
+    return ChoiceSweep(list=[*map(float, inside)])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 import threading
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -220,14 +221,10 @@ def _outcome(
             # COLMAP dies of a full disk without saying so. The scene is not at fault then.
             store.check_room()
         # The reason that the store keeps: a sweep that is planned again has the same record then.
-        return _failure(conf, store) or PlannedVariant(error=str(error))
-
-
-def _failure(conf: Conf, store: Store) -> PlannedVariant | None:
-    try:
-        return _failed_before(store, variant.key(conf.scene, conf.variant))
-    except XrgsError:  # the photographs are not there, or the reason can't be read now
-        return None
+        with suppress(XrgsError):  # the photographs are not there, or it can't be read now
+            if failed := _failed_before(store, variant.key(conf.scene, conf.variant)):
+                return failed
+        return PlannedVariant(error=str(error))
 
 
 def _failed_before(store: Store, key: str) -> PlannedVariant | None:

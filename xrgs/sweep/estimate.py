@@ -14,16 +14,16 @@ from dataclasses import asdict, astuple, dataclass
 from datetime import datetime
 from functools import cache
 from statistics import fmean, median
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from xrgs.composing import dotted
 from xrgs.errors import StoreError, XrgsError
 from xrgs.mixture import saved_variant
-from xrgs.mixture.paths import trimmed_folder
 from xrgs.splat.backend import resolve_backend
 from xrgs.store.provenance import processor, this_processor
+from xrgs.store.trimming import home_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
     from pathlib import Path
 
     from xrgs.config import Conf
@@ -166,25 +166,14 @@ def _scaled(past: _Finished, conf: Conf, pixels: float, threads: int, backend: s
 
 def _settings(conf: Conf) -> frozenset[tuple[str, str]]:
     groups = {name: asdict(getattr(conf, name)) for name in ("splat", "train", "components")}
-    return frozenset(_flat(groups))
-
-
-def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Yield each value of nested dicts with its dotted key, as `splat.densify.every`."""
-    for key, value in values.items():
-        if isinstance(value, dict):
-            yield from _flat(value, f"{prefix}{key}.")
-        elif f"{prefix}{key}" not in {"train.steps", "splat.backend"}:
-            yield f"{prefix}{key}", repr(value)
+    ignored = {"train.steps", "splat.backend"}
+    return frozenset((key, repr(value)) for key, value in dotted(groups) if key not in ignored)
 
 
 @cache
 def read_views(variants: Path, variant_id: str) -> tuple[ViewEntry, ...]:
     """Return the list of a variant's views, trimmed or not."""
-    folder = variants / variant_id
-    if not folder.is_dir():
-        folder = trimmed_folder(variants, variant_id)
-    return saved_variant.read_manifest(folder).views
+    return saved_variant.read_manifest(home_of(variants, variant_id)).views
 
 
 def _pixels(variants: Path, variant_id: str, conf: Conf) -> tuple[float, int]:

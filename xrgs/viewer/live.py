@@ -88,7 +88,10 @@ def shown(models: Sequence[Model], port: int, limit: int) -> Iterator[str]:
     Raises:
         XrgsError: viser is missing, or the port can't be used.
     """
-    viser = _viser()
+    try:
+        import viser
+    except ImportError as error:
+        raise XrgsError("the live viewer needs viser: pip install 'xrgs[view]'") from error
     with ExitStack() as stack:
         page = _PageServer(port)
         stack.callback(page.server_close)
@@ -124,14 +127,6 @@ def _without_banners() -> Iterator[None]:
     """Hide viser's output: it prints the addresses of single frames, which nobody should open."""
     with redirect_stdout(io.StringIO()):
         yield
-
-
-def _viser() -> Any:
-    try:
-        import viser
-    except ImportError as error:
-        raise XrgsError("the live viewer needs viser: pip install 'xrgs[view]'") from error
-    return viser
 
 
 class _PageServer(ThreadingHTTPServer):
