@@ -57,9 +57,6 @@ def measure(
     Returns:
         `this` and `other`: folder of the package, and its instruction set; `scene` and `step`:
         sizes of the loads; `rows`: the result of `summarize`.
-
-    Raises:
-        XrgsError: `python` is not an executable file, or a worker fails.
     """
     # Not resolved: the Python of a virtual environment is a link, and finds the environment by its
     # own path.
@@ -175,17 +172,10 @@ def _take_turns(
 def summarize(durations: Durations, counts: Sequence[int]) -> list[Row]:
     """Compare the two installations, repetition by repetition.
 
-    Args:
-        durations: (side, one of `SIDES`; task; number of threads) -> time of each repetition, ms.
-        counts: Numbers of threads, ascending; the first is 1.
-
-    Returns:
-        A row for each task (including the mean step) and number of threads, with the columns
-
-        - `this_ms`, `other_ms`: median times;
-        - `times_faster`: median ratio of the other's time over this one's, with the quartiles
-          `times_faster_low` and `times_faster_high`;
-        - `this_speedup`, `other_speedup`: median speed-ups over one thread.
+    There is a row for each task (including the mean step) and number of threads: median times
+    (`this_ms`, `other_ms`); `times_faster`, the median ratio of the other's time over this one's,
+    with the quartiles `times_faster_low` and `times_faster_high`; and `this_speedup`,
+    `other_speedup`, the median speed-ups over one thread.
     """
     durations = dict(durations)
     for side in SIDES:

@@ -196,15 +196,12 @@ def total_ms(row: Row) -> float:
 
 
 def errors(load: Load, methods: Sequence[RenderMethod]) -> dict[str, dict[str, float]]:
-    """Compare each method with the torch backend in float64 at gsplat's settings.
+    """Compare each method with the torch backend in float64 at gsplat's settings, by its name.
 
     Only the centre of the view (`ERROR_CROP`) is rendered. All methods must have the same
-    `sh_degree`.
-
-    Returns:
-        Name of a method -> `image_mean_error` and `image_max_error`, absolute errors of the image,
-        and `gradient_error`, the norm of a gradient's error over the norm of the gradient: the
-        largest of the six parameters.
+    `sh_degree`. `image_mean_error` and `image_max_error` are absolute errors of the image, and
+    `gradient_error` is the norm of a gradient's error over the norm of the gradient: the largest of
+    the six parameters.
     """
     crop, threads = load.center_crop(*ERROR_CROP), torch.get_num_threads()
     exact = RenderMethod("exact", "torch", sh_degree=methods[0].sh_degree, dtype=torch.float64)
@@ -229,12 +226,9 @@ def time_shortcuts(load: Load, backend: str, repeats: int) -> list[Row]:
 
     A shortcut skips work that does not change the result. The kinds of culling (`CullingOptions`)
     are shortcuts of the native backend. Both backends skip the bands of the spherical harmonics
-    above the degree that training has reached.
-
-    Returns:
-        A row for each shortcut: `shortcut`, sizes, `times` (time off over time on), `same_bits`
-        (whether image and gradients are equal on and off) and, with the prefixes `on_` and `off_`,
-        times (ms), alpha evaluations and errors.
+    above the degree that training has reached. A row has the `shortcut`, sizes, `times` (time off
+    over time on), `same_bits` (whether image and gradients are equal on and off) and, with the
+    prefixes `on_` and `off_`, times (ms), alpha evaluations and errors.
     """
     all_on = RenderMethod("on", backend)
     rows = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -195,14 +196,13 @@ def write_export(path: Path, out: Path | None, layout: str = "auto") -> str:
     return write(path, layout, out or Path(f"{path.name}-{layout}"))
 
 
-def main() -> None:
-    """Run `xrgs-data`."""
-    options.run(
-        "xrgs-data",
-        {"download": download, "lpips": lpips, "inspect": inspect, "export": export},
-        "Download photographs and the weights of LPIPS, show and export variants.",
-        overrides="inspect",
-    )
+main = partial(
+    options.run,
+    "xrgs-data",
+    {"download": download, "lpips": lpips, "inspect": inspect, "export": export},
+    "Download photographs and the weights of LPIPS, show and export variants.",
+    overrides="inspect",
+)
 
 
 def as_they_are(photographs: str) -> list[str]:

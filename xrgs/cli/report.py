@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Annotated
 
 from tyro.conf import arg
@@ -78,8 +79,10 @@ def list_sweeps(store: Folder = STORE) -> None:
     say(status.list_sweeps(Store(store).sweep_rows()))
 
 
-def main() -> None:
-    """Run `xrgs-report` or `xrgs-report list`."""
-    options.run(
-        "xrgs-report", {"report": report, "list": list_sweeps}, _DESCRIPTION, default="report"
-    )
+main = partial(
+    options.run,
+    "xrgs-report",
+    {"report": report, "list": list_sweeps},
+    _DESCRIPTION,
+    default="report",
+)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from xrgs.cli import options
 from xrgs.cli.options import STORE, Flag, Folder
 from xrgs.runtime.streams import say
@@ -26,6 +28,4 @@ def status(store: Folder = STORE, watch: Flag = False) -> None:
         say(describe(store))
 
 
-def main() -> None:
-    """Run `xrgs-status`."""
-    options.run("xrgs-status", status)
+main = partial(options.run, "xrgs-status", status)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import shlex
 import time
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from statistics import fmean
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -306,6 +307,4 @@ def _say(line: str) -> None:
     say(for_line(line))
 
 
-def main() -> None:
-    """Run `xrgs-train`."""
-    options.run("xrgs-train", train, overrides="xrgs-train")
+main = partial(options.run, "xrgs-train", train, overrides="xrgs-train")

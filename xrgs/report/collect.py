@@ -209,11 +209,7 @@ def is_component_log(column: str) -> bool:
 def _curve(
     file: Path, summary: Summary, views: list[tuple[str, dict[str, float]]]
 ) -> list[dict[str, float]]:
-    """Return `DoneCell.curve`; a missing score is NaN.
-
-    Raises:
-        StoreError: The file is damaged, or lacks a column.
-    """
+    """Return `DoneCell.curve`; a missing score is NaN. StoreError says that the file is damaged."""
     last: dict[str, float] = {
         "step": summary.steps,
         "seconds": summary.training_time_s,
@@ -375,10 +371,7 @@ class ReportStore(Store):
         """Folders of another program's renders, see `Sweep.renders`."""
 
     def render(self, cell_id: str, view: str) -> Path:
-        """Return the file of the render of a view, whether or not it exists.
-
-        Raises:
-            StoreError: The cell's renders were trimmed, or its id is not a valid name.
+        """Return the file of a view's render, which need not exist; StoreError if it was trimmed.
         """
         if cell_id in self.external:
             return self.external[cell_id] / f"{view}.png"
@@ -393,16 +386,11 @@ class ReportStore(Store):
     def sweep_records(
         self, sweep_ids: Sequence[str]
     ) -> tuple[dict[str, tuple[str, ...]], list[RecordedCell]]:
-        """Join the records of sweeps.
-
-        Returns:
-            The id of each sweep -> the arguments of `xrgs-sweep`; and the rows of all records, one
-            for each scene, condition, label and replicate.
+        """Return the command of each sweep, by its id, and the rows of all records, each run once.
 
         Raises:
             StoreError: There is no such sweep, or its record is damaged.
-            ReportError: Two records have different cells for one scene, condition, label and
-                replicate; the message names both.
+            ReportError: Two records have different cells for one run; the message names both.
         """
         commands: dict[str, tuple[str, ...]] = {}
         rows: dict[tuple[object, ...], tuple[str, RecordedCell]] = {}

@@ -222,14 +222,11 @@ _MIN_DISTANCE = 3.0
 def decided_by_one_view(
     comparison: Comparison, views: pd.DataFrame
 ) -> dict[tuple[str, str], list[str]]:
-    """Warn of pairs where one view decides the change in PSNR.
+    """Warn of pairs where one view decides the change in PSNR, by label and condition.
 
     A scene has few test views, and PSNR has no bound: a floater in front of one test camera can
-    cost its view 10 dB, which is more than all other views gain together.
-
-    Returns:
-        (label, condition) -> a sentence for each such pair: the view, and the change with and
-        without it.
+    cost its view 10 dB, which is more than all other views gain together. A sentence names the
+    view, and the change with and without it.
     """
     changes = _changes_of_views(comparison, views)
     pairs = _with_and_without(changes)
@@ -312,8 +309,7 @@ def with_variants(sweep: Sweep, store: ReportStore) -> Sweep:
 def photographs(sweep: Sweep) -> list[tuple[str, tuple[str, ...]]]:
     """Return (scene, sentences on its photographs) for the scenes with finished cells.
 
-    The sentences come from all variants of the scene, and from its cells' trainings (blur,
-    exposure) with the cell's label.
+    They come from all variants of the scene, and from its cells' trainings (blur, exposure).
     """
     done = sweep.cells[sweep.cells["variant_id"].isin(sweep.variants)]
     by_scene = []

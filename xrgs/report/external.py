@@ -62,10 +62,7 @@ class External:
 
 
 def parse(words: Sequence[str]) -> tuple[External, ...]:
-    """Read the words of `xrgs-report --external LABEL:FOLDER LABEL:FOLDER`.
-
-    Args:
-        words: Folders, each as `LABEL:FOLDER`, or only `FOLDER`, whose name is then the label.
+    """Read the words of `xrgs-report --external`: LABEL:FOLDER, or a folder that is its own label.
 
     Raises:
         ReportError: A label or a folder is empty, or two labels are the same.
@@ -90,19 +87,10 @@ def parse(words: Sequence[str]) -> tuple[External, ...]:
 def with_external(sweep: Sweep, store: ReportStore, externals: Sequence[External]) -> Sweep:
     """Return a sweep with one more row for each variant that another program has rendered.
 
-    A program has one set of renders for a variant. In each condition, they are compared with the
+    A program has one set of renders for a variant: `<view>.png` for each scored view, in the folder
+    `<scene>/<variant.seed>/`. If a scene has one draw of HR views, `<scene>/` will do, and if the
+    sweep also has only one scene, the folder itself. In each condition they are compared with the
     cells of the lowest seed.
-
-    Args:
-        sweep: The sweep.
-        store: The stores that have the sweep's variants.
-        externals: The programs' renders: `<view>.png` for each scored view, in the folder
-            `<scene>/<variant.seed>/`. If a scene has one draw of HR views, `<scene>/` will do, and
-            if the sweep also has only one scene, the folder itself. `figures.json` beside them may
-            have numbers of the training.
-
-    Returns:
-        The sweep with these rows in `cells` and `views`, and their folders in `renders`.
 
     Raises:
         ReportError: Cells already have the label, a folder or a render is missing, or a render is

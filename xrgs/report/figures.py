@@ -81,15 +81,9 @@ def _default_style() -> Iterator[None]:
 
 
 def differing_crop(first: Image, second: Image, zoom: int = _ZOOM) -> tuple[slice, slice]:
-    """Find the window, `zoom` times smaller than two images, in which they differ most.
+    """Find the window, `zoom` times smaller than two images [H, W, 3], in which they differ most.
 
-    Args:
-        first: [H, W, 3] in 0..1.
-        second: [H, W, 3] in 0..1.
-        zoom: The ratio of the images' sides to the window's.
-
-    Returns:
-        The window's rows and columns; of equally different windows, the topmost, then the leftmost.
+    Return its rows and columns; of equally different windows, the topmost, then the leftmost.
     """
     difference = np.abs(first.astype(np.float64) - second).mean(axis=2)  # [H, W]
     height, width = (max(1, side // zoom) for side in difference.shape)

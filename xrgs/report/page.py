@@ -88,20 +88,14 @@ def build(
 
     Args:
         store_path: The store's folder.
-        sweep_ids: The id of the sweep, or the ids of those to join; None takes the latest one.
-        out: The folder to write to; None takes `reports/<sweep ids>` in the store, with
-            `.scenes-<names>` and `.ablations-<names>` added for a choice, and `.against-<label>`
-            for another base than the baseline.
+        sweep_ids: The ids of the sweeps; None takes the latest one.
+        out: The folder to write to; None takes the one that `xrgs-report --help` names.
         pictures: Names of the pictures to draw, see `xrgs.report.pictures.draw`; None draws all.
         against: The label that all others are compared with. If no cell is a baseline
             (`baseline=false`), the first label replaces the baseline.
         choice: The scenes and ablations of the report.
-        externals: Renders of other programs; each becomes one more label. The default folder's name
-            then ends with `.with-<label>` for each.
+        externals: Renders of other programs; each becomes one more label.
         design: Outcomes, headline labels and margins of the tests; None takes the defaults.
-
-    Returns:
-        The report: its text and its files.
 
     Raises:
         StoreError: The store has no such sweep.

@@ -119,9 +119,8 @@ def why_no_table(labels: Iterable[str], scenes: Iterable[str]) -> str:
 def paper_tables(comparison: Comparison, contexts: Mapping[str, Context]) -> list[TextTable]:
     """Return the paper's tables beside the changes of full XR-GS from the baseline.
 
-    Returns:
-        A table for each condition and each column of the paper whose scenes the comparison has;
-        empty if no label is full XR-GS, or the base is not the baseline.
+    There is a table for each condition and each column of the paper whose scenes the comparison
+    has; none if no label is full XR-GS, or the base is not the baseline.
     """
     labels = {label for label, _ in comparison.groups}
     if comparison.base != BASELINE or labels.isdisjoint(_READINGS):
@@ -217,11 +216,9 @@ _PHOTOGRAPH = ["variant_id", "split", "view"]
 
 
 def with_texture(store: ReportStore, cells: pd.DataFrame, views: pd.DataFrame) -> pd.DataFrame:
-    """Add the texture of each view's photograph to the scores of views.
+    """Add the `texture` of each view's photograph to the scores of views, in intensity per px.
 
-    Returns:
-        The views, with `texture` in intensity per px of the photograph. It is NaN where the
-        photograph can't be read, or was removed by a version that did not keep its texture.
+    It is NaN where the photograph can't be read, or was removed by a version that did not keep it.
     """
     scored = cells.drop_duplicates("cell_id").set_index("cell_id")[["variant_id", "validation"]]
     rows = views.join(scored, on="cell_id")
@@ -243,9 +240,8 @@ def texture_tables(
 ) -> list[TextTable]:
     """Return tables of changes by texture, for conditions with at least three scenes.
 
-    Returns:
-        Tables with a row for each ablation and score: the change of each scene, the least textured
-        scene first, and Spearman's rank correlation of texture and change.
+    They have a row for each ablation and score: the change of each scene, the least textured scene
+    first, and Spearman's rank correlation of texture and change.
     """
     keys = comparison.cells.drop_duplicates("cell_id")[["cell_id", "condition", "scene"]]
     rows = views[["cell_id", "view", "texture"]].merge(keys, on="cell_id")

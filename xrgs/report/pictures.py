@@ -82,18 +82,13 @@ def draw(
     folder: Path,
     names: Sequence[str] | None = None,
 ) -> list[Picture]:
-    """Draw the pictures of a report.
+    """Draw the pictures of a report, in the order of the tables.
 
     For each condition: the trade-offs of its ablations if there are several, and quality during
     training if it was evaluated. For each setting with at least three values: the changes over it.
-    For each scene and ablation: views and training curves of the first condition and replicate,
-    which the titles name. `names` are their files without suffix; None draws the first 40.
-
-    Returns:
-        The pictures, in the order of the tables.
-
-    Raises:
-        ReportError: There is no picture of such a name.
+    For each scene and ablation: views and training curves of the first condition and replicate.
+    `names` are their files without suffix; None draws the first 40. ReportError says that there is
+    no picture of such a name.
     """
     first = comparison.pairs.sort_values(["variant_seed", "seed"], kind="stable")
     pairs = first.drop_duplicates(["scene", "label"]).sort_values(["scene", "label"])
@@ -173,16 +168,13 @@ def _sensitivities(comparison: Comparison) -> dict[str, _Drawing]:
 
 
 def sensitivities(comparison: Comparison) -> dict[str, pd.DataFrame]:
-    """Return how the changes depend on each numeric setting that was swept.
+    """Return how the changes depend on each numeric setting with at least three values, by its key.
 
     The values are read from labels, for a setting of the ablation (`consistency.weight=0.05`), and
-    from conditions, for a setting that the base has too (`variant.factor=2`).
-
-    Returns:
-        Key of a setting with at least three values -> one row for each change: `level` (`pair`,
-        `scene` or `mean`), `scene` (missing for a mean), `metric`, `change`, `value` (of the
-        setting), `ablation` (the label without the setting) and `series` (label and condition
-        without the setting; each series is a curve).
+    from conditions, for a setting that the base has too (`variant.factor=2`). A table has a row for
+    each change: `level` (`pair`, `scene` or `mean`), `scene` (missing for a mean), `metric`,
+    `change`, `value` (of the setting), `ablation` (the label without the setting) and `series`
+    (label and condition without the setting; each series is a curve).
     """
     changes = _changes(comparison)
     by_key = {}
@@ -210,11 +202,9 @@ def _changes(comparison: Comparison) -> pd.DataFrame:
 
 
 def _settings(groups: Iterable[tuple[str, str]]) -> dict[str, pd.DataFrame]:
-    """Read the numeric settings in labels and conditions.
+    """Return the `value`, `ablation` and `series` of `sensitivities` for each numeric setting.
 
-    Returns:
-        Key of a setting -> one row for each (label, condition) with the setting: `label`,
-        `condition`, and `value`, `ablation` and `series` of `sensitivities`.
+    There is a row for each label and condition with the setting.
     """
     by_key: dict[str, list[tuple[str, str, float, str, str]]] = {}
     for label, condition in groups:
@@ -295,12 +285,7 @@ def _drawn(title: str, figure: Callable[[], bytes], file: Path) -> Picture:
 def median_view(base: pd.Series, ablation: pd.Series) -> str:
     """Return the view with the median change of PSNR: neither the best nor the worst case.
 
-    Args:
-        base: PSNR of the base in dB, indexed by view.
-        ablation: PSNR of the ablation in dB, indexed by view.
-
-    Returns:
-        The name of the view; for an even number of views, the lower of the two in the middle.
+    Both have the PSNR of each view, dB. Of an even number of views it is the lower in the middle.
     """
     change = (ablation - base.reindex(ablation.index)).fillna(0.0).sort_index()
     return str(change.sort_values(kind="stable").index[(len(change) - 1) // 2])

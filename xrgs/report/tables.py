@@ -132,9 +132,8 @@ class Tables:
     def unchanged(self, label: str, condition: str) -> str:
         """Say why an ablation has nothing to compare: its cells or results are those of the base.
 
-        Returns:
-            The end of a sentence that begins with the label; empty if something changed. Times and
-            the memory of the process don't count, since they differ in every run.
+        It is the end of a sentence that begins with the label, and empty if something changed.
+        Times and the memory of the process don't count, since they differ in every run.
         """
         pairs, base = self.comparison.pairs, self.comparison.base
         own_pairs = pairs[(pairs["label"] == label) & (pairs["condition"] == condition)]
@@ -298,9 +297,8 @@ class Tables:
     def gaps(self) -> list[TextTable]:
         """Return a table of shares of the gap for each condition with all_hr and another ablation.
 
-        It has a row for each ablation and score: the share of the gap in percent, scene by scene
-        and in the mean over scenes, with its interval and sign test. Notes say why a scene has no
-        share, or why pairs are left out of a mean.
+        It has the share of each ablation and score in percent, scene by scene and in the mean over
+        scenes. Notes say why a scene has no share, or why pairs are left out of a mean.
         """
         means, per_scene = by_key(self.comparison.gaps), by_key(self.comparison.gaps_per_scene)
         conditions = dict.fromkeys(condition for _, condition, _ in means)

@@ -94,10 +94,9 @@ _KINDS = {
 def totals(cells: pd.DataFrame, done: Mapping[str, DoneCell]) -> pd.DataFrame:
     """Return the counts of training in each of `Comparison.cells` that is done.
 
-    Returns:
-        One row for each cell: `CELL_KEYS`, and a column for each count of its history (at the end
-        of training) and each value that a component logged (its mean over training); NaN for a cell
-        without it.
+    There is a row for each cell: `CELL_KEYS`, and a column for each count of its history (at the
+    end of training) and each value that a component logged (its mean over training); NaN for a cell
+    without it.
     """
     keys = cells.loc[cells["cell_id"].isin(done), CELL_KEYS].drop_duplicates("cell_id")
     keys = keys.reset_index(drop=True)
@@ -136,10 +135,7 @@ def _count(value: float | None, *, is_component_log: bool) -> str:
 
 
 def _work(cell: DoneCell) -> dict[str, float]:
-    """Return the totals of a cell: of its summary, and counts of steps that skipped something.
-
-    Cells of older versions have no `work` and no seconds of stages.
-    """
+    """Return the totals of a cell; older versions kept no `work` and no seconds of stages."""
     summary = cell.summary
     return {
         **summary.work,
@@ -154,11 +150,10 @@ def _work(cell: DoneCell) -> dict[str, float]:
 def skipped(cells: pd.DataFrame, done: Mapping[str, DoneCell]) -> pd.DataFrame:
     """Return the work that each of `Comparison.cells` skipped.
 
-    Returns:
-        One row for each cell and kind of work with known counts: `CELL_KEYS` and `kind`; the
-        skipped `number`, and its `share` of the total; the estimated `cost` of the skipped work in
-        the kind's `unit` (`s` or `evaluations`), and `cost_share`, the cost over that of the whole
-        run. The costs are NaN if unknown.
+    There is a row for each cell and kind of work with known counts: `CELL_KEYS` and `kind`; the
+    skipped `number`, and its `share` of the total; the estimated `cost` of the skipped work in the
+    kind's `unit` (`s` or `evaluations`), and `cost_share`, the cost over that of the whole run. The
+    costs are NaN if unknown.
     """
     rows = []
     finished = cells[cells["cell_id"].isin(done)].drop_duplicates(CELL_KEYS)

@@ -1,12 +1,10 @@
 """Packs results of a store for other people, and imports their stores.
 
-`pack` writes done cells, their variants and the records of their sweeps into one archive, which is
-a store when it is unpacked. The archive has the files that reports are made from and that sweeps
-continue from. It has no logs, and no full paths: those in configs and commands become relative.
+A pack is a store when it is unpacked, with the files that reports are made from and that sweeps
+continue from. It has no logs, and no full paths.
 
-`import_store` copies a store of somebody else, an archive or a folder, into one's own. Archives are
-unpacked by tarfile's filter `data`. JSON and CSV files are decoded by their types, and all files
-are verified by their hashes. An item that fails a check is left out and named.
+An import unpacks archives by tarfile's filter `data`. JSON and CSV files are decoded by their
+types, and all files are verified by their hashes. An item that fails a check is left out and named.
 """
 
 from __future__ import annotations
@@ -82,18 +80,11 @@ class Copied:
 def pack(
     store: Store, cells: Sequence[CellFolder], out: Path, here: Path, sweeps: Sequence[str] = ()
 ) -> Copied:
-    """Write an archive of done cells; the store does not change.
+    """Write an archive (`.tar.xz`, replaced) of cells that are all done; the store does not change.
 
-    Args:
-        store: The store.
-        cells: The cells to pack, all of them done.
-        out: The archive to write or replace, `.tar.xz`; its folder must exist.
-        here: The folder below which full paths in configs and commands are made relative; of a path
-            elsewhere only the last name is kept.
-        sweeps: Ids of the sweeps whose records are packed; empty for all that have such a cell.
-
-    Raises:
-        StoreError: `out` can't be written, or the store can't be read.
+    Full paths in configs and commands are made relative to `here`; of a path elsewhere only the
+    last name is kept. `sweeps` are ids of the sweeps whose records are packed; empty for all that
+    have such a cell. StoreError says that `out` can't be written, or the store not be read.
     """
     left_out: list[str] = []
 
@@ -208,15 +199,12 @@ _REQUIRED = ("config.json", "identity.json", "provenance.json", "summary.json", 
 
 
 def import_store(source: Path, store: Store) -> Copied:
-    """Copy a store of somebody else into one's own, after every file is checked.
+    """Copy a store of somebody else, an archive or a folder, into one's own, after every file is
+    checked.
 
     Cells that are not done, checkpoints, logs and reports are not imported. Each cell, variant,
-    scene and record gets its name once it is whole and on the disk. An import that was stopped
-    goes on when it is run again.
-
-    Args:
-        source: The archive (`.tar`, `.tar.xz`, `.tar.gz`, `.tar.bz2`), or the folder of a store.
-        store: The store to copy to; it is made where it is missing.
+    scene and record gets its name once it is whole and on the disk. An import that was stopped goes
+    on when it is run again.
 
     Raises:
         StoreError: The source is no store; an archive is damaged, or has a link or a name outside

@@ -50,13 +50,8 @@ def begin_attempt(cell: CellFolder, is_owner: Callable[[], bool] = lambda: True)
     renamed to `<cell id>.aside-<n>`, so that it can be inspected.
 
     The caller holds the cell's lease. Right before the folder is replaced, `is_owner` is asked
-    whether it still does.
-
-    Returns:
-        False where the lease was lost; nothing has changed then.
-
-    Raises:
-        UnreadableError: A file can't be read now.
+    whether it still does; if not, False is returned and nothing has changed. UnreadableError says
+    that a file can't be read now.
     """
     folder = cell.path
     stopped = _stopped(cell)

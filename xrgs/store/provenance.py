@@ -46,11 +46,8 @@ def _instruction_set(backend: str) -> str | None:
 
 
 def collect(threads: int, backend: str) -> Provenance:
-    """Return the program, its libraries, the machine and the time.
-
-    Args:
-        threads: The threads that the cell uses.
-        backend: `native`, `torch` or `gsplat`.
+    """Return the program, its libraries, the machine and the time, for a cell's threads and
+    backend.
 
     Raises:
         WeightsError: The weights of LPIPS on this machine are not the published ones. A cell that

@@ -87,17 +87,14 @@ def rescore(
 ) -> tuple[str, bool]:
     """Score done cells anew where their scores lack a metric, or are of other code.
 
+    Views are rendered from the cell's Gaussians, as after its training, and `scores.csv` and the
+    renders are replaced. A cell that is being trained, is not done, has no Gaussians any more, or
+    was trained with another rasterizer is left. Scores of `ON_REQUEST` that are named in `also` are
+    added; a cell that has one keeps it.
+
     Return lines for a terminal on the cells that are left, and on how many were scored, and whether
-    none is left.
-
-    The views are rendered from the cell's Gaussians, as after its training, and `scores.csv` and
-    the renders are replaced. A cell that is being trained, is not done, has no Gaussians any more,
-    or was trained with another rasterizer is left as it is.
-
-    Scores of `ON_REQUEST` that are named in `also` are added. A cell that has one keeps it.
-
-    Raises:
-        XrgsError: The store can't be written, or a score is none of `ON_REQUEST`.
+    none is left. XrgsError says that the store can't be written, or that a score is none of
+    `ON_REQUEST`.
     """
     if unknown := sorted(set(also) - ON_REQUEST):
         raise XrgsError(f"also={unknown[0]}: choose from: {', '.join(sorted(ON_REQUEST))}")

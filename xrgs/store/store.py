@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import stat
 import tempfile
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -56,7 +55,6 @@ class StoreGoneError(StoreError):
     """The store was moved, deleted or unmounted while a sweep used it."""
 
 
-@dataclass(frozen=True)
 class Store:
     """A store: everything that sweeps keep, in one folder.
 
@@ -69,41 +67,21 @@ class Store:
         >>> gaussians = load_gaussians(file).gaussians
     """
 
-    path: Path
-    """The folder."""
-
     def __init__(self, path: str | Path) -> None:
-        object.__setattr__(self, "path", Path(path))
-
-    @property
-    def scenes(self) -> Path:
+        self.path = Path(path)
+        """The folder."""
+        self.scenes = self.path / "scenes"
         """Folder of the rendered photographs of procedural scenes."""
-        return self.path / "scenes"
-
-    @property
-    def variants(self) -> Path:
+        self.variants = self.path / "variants"
         """Folder of the frozen variants."""
-        return self.path / "variants"
-
-    @property
-    def cells_folder(self) -> Path:
+        self.cells_folder = self.path / "cells"
         """Folder of the cells."""
-        return self.path / "cells"
-
-    @property
-    def leases(self) -> Path:
+        self.leases = self.path / "locks"
         """Folder of the leases of cells that are being trained."""
-        return self.path / "locks"
-
-    @property
-    def sweeps(self) -> Path:
+        self.sweeps = self.path / "sweeps"
         """Folder of the records of sweeps."""
-        return self.path / "sweeps"
-
-    @property
-    def reports(self) -> Path:
+        self.reports = self.path / "reports"
         """Folder of the reports: tables and figures."""
-        return self.path / "reports"
 
     @property
     def exists(self) -> bool:

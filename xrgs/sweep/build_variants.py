@@ -60,12 +60,9 @@ def build(
 ) -> str:
     """Build the variant of a config in a child process, and return its id.
 
-    A message tells the `place` among several builds. The child is ended when `is_over`, and has
-    the variables of `environment` besides those of this process.
-
-    Raises:
-        WorkError: The build failed, or the disk is full or can't be written.
-        XrgsError: The photographs are missing, or can't be made into a variant.
+    A message tells the `place` among several builds. The child is ended when `is_over`, and has the
+    variables of `environment` besides those of this process. WorkError says that the build failed,
+    or the disk is full or can't be written.
     """
 
     def on_poll(_: int) -> None:
@@ -139,13 +136,9 @@ def find_or_build(conf: Conf, store: Store) -> str:
 def plan(confs: Sequence[Conf], store: Store, *, allow_build: bool) -> list[PlannedVariant]:
     """Return the variants of configs for a sweep, or the reasons why there are none.
 
-    The variants that the store lacks are built, several at once. A scene that failed before is not
-    tried again, like a failed cell, unless `retry=failed`.
-
-    In a dry run `allow_build` is False.
-
-    Raises:
-        StoreError: The store can't be written, or is no longer there.
+    The variants that the store lacks are built, several at once, unless `allow_build` is False, as
+    in a dry run. A scene that failed before is not tried again, like a failed cell, unless
+    `retry=failed`. StoreError says that the store can't be written, or is no longer there.
     """
     stored = [_outcome(_stored_variant, conf, store) for conf in confs]
     lacking = {i: confs[i] for i, planned in enumerate(stored) if planned is None}

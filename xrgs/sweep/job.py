@@ -147,10 +147,8 @@ def run_hydra_job(cfg: DictConfig) -> str:
 
 
 def run_job(session: SweepSession, store: Store, cell_id: str, name: str) -> str:
-    """Run one cell of a sweep, unless there is a reason not to.
-
-    Returns:
-        The cell's state, or `LOCKED`, `STOPPED`, `UNWRITABLE`, `GONE` or `INTERRUPTED`.
+    """Run one cell of a sweep, unless there is a reason not to; return its state or another
+    outcome.
 
     Raises:
         XrgsError: The installed code is not the planned one, or the variant of the cell is missing,

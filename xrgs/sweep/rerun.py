@@ -81,10 +81,9 @@ def rerun(
     Args:
         folder: The cell's folder, in a store or elsewhere.
         out: Folder to write to; by default `<folder>.rerun-1`, or the next free number.
-        store: The store that has the cell's variant, or in which the variant is built; by default
-            the store that the folder is in.
-        threads: Number of threads; by default as many as the cell was trained with. No result
-            should depend on it.
+        store: The store that has the cell's variant, or in which it is built; by default the one
+            that the folder is in.
+        threads: By default as many as the cell was trained with. No result should depend on it.
         photographs: Replaces the config's `scene.path`, if the variant has to be built.
         plugins: Names of the components of other packages that may be imported. A cell that needs
             another one is refused: a store must not decide which code is imported.

@@ -52,12 +52,10 @@ def make_film(
     size: tuple[int, int] | None = None,
     fps: int = 30,
 ) -> str:
-    """Render models along a path through the scene.
-
-    The path is fitted to the cameras of the first model that has any.
+    """Render models of one world side by side along a path through the scene.
 
     Args:
-        models: One model, or several of one world, which are shown side by side with their names.
+        models: The models; the path is fitted to the cameras of the first that has any.
         out: An .mp4 file, which is replaced, or a new or empty folder for PNGs, one for each frame.
         path: A name in `xrgs.viewer.paths.PATHS`; None for `orbit`, or for `training` if an orbit
             would leave the space that the training cameras see.

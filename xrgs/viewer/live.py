@@ -74,16 +74,10 @@ _POLICY = f"default-src 'none'; style-src 'unsafe-inline'; frame-src http://{HOS
 
 @contextmanager
 def shown(models: Sequence[Model], port: int, limit: int) -> Iterator[str]:
-    """Show models while a `with` block runs.
+    """Show models of one world while a `with` block runs; yield the address of the page.
 
-    Args:
-        models: One model, or several of one world.
-        port: The port of the page; viser's servers take the next free ones. 0 lets the system
-            choose all of them.
-        limit: The most Gaussians of a model that are drawn, see `xrgs.viewer.live.to_splats`.
-
-    Yields:
-        The address of the page.
+    viser's servers take the next ports after that of the page, which is `port`; 0 lets the system
+    choose all of them. At most `limit` Gaussians of a model are drawn.
 
     Raises:
         XrgsError: viser is missing, or the port can't be used.

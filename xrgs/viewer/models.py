@@ -60,17 +60,10 @@ class Model:
 
 
 def load_models(words: Sequence[str], store: Store, antialiased: bool | None = None) -> list[Model]:
-    """Load one model, or two of one world.
+    """Load one model, or two of one world, each a cell as of `Store.find_cell` or a file.
 
-    Args:
-        words: The cells, each as `Store.find_cell` takes it, or as the path of a .ply, .glb or
-            .spz file.
-        store: The store that has the cells.
-        antialiased: Whether to render antialiased; None renders each as it was trained. A warning
-            names a model that was trained otherwise.
-
-    Returns:
-        The models, in the order of the words.
+    `antialiased` says whether to render antialiased; None renders each as it was trained. A warning
+    names a model that was trained otherwise.
 
     Raises:
         XrgsError: There are no words or too many, a word names no finished cell, a file is damaged,

@@ -84,10 +84,8 @@ def run_names(row: Mapping[str, Any] | pd.Series) -> dict[str, str]:
 def runs(comparison: Comparison) -> Iterator[pd.DataFrame]:
     """Yield the finished cells of each scene, condition and replicate, the base first.
 
-    The first replicates of all scenes and conditions come before the second ones.
-
-    Yields:
-        Rows of `Comparison.cells`, one for each label.
+    They are rows of `Comparison.cells`, one for each label. The first replicates of all scenes and
+    conditions come before the second ones.
     """
     cells = comparison.cells
     done = cells[cells["state"] == "done"].drop_duplicates([*RUN, "label"])

@@ -77,11 +77,9 @@ class Album:
         self._quality = next(fitting, _QUALITIES[-1][0])
 
     def add(self, images: Sequence[Image.Image]) -> list[int] | None:
-        """Add RGB images that belong together.
+        """Add RGB images that belong together; return the index of each in the page's images.
 
-        Returns:
-            The index of each in the page's images. If they do not fit, none is added, and the
-            result is None.
+        If they do not fit, none is added, and the result is None.
         """
         urls = [data_url(image, self._quality) for image in images]
         new = dict.fromkeys(url for url in urls if url not in self._numbers)
@@ -114,14 +112,10 @@ def to_image(array: NDArray[np.float32]) -> Image.Image:
 
 
 def error_map(photograph: Image.Image, render: Image.Image) -> Image.Image:
-    """Draw the difference of a render from its photograph, RGB images of one size.
+    """Draw the difference of a render from its photograph, RGB images of one size; else ValueError.
 
-    Returns:
-        The mean absolute difference of the channels, from black at 0 to pale yellow at
-        `ERROR_RANGE` (matplotlib's magma), at half the size.
-
-    Raises:
-        ValueError: The sizes differ.
+    It is the mean absolute difference of the channels, from black at 0 to pale yellow at
+    `ERROR_RANGE` (matplotlib's magma), at half the size.
     """
     if photograph.size != render.size:
         raise ValueError("photograph and render differ in size")
