@@ -9,11 +9,14 @@ from __future__ import annotations
 import math
 import re
 import threading
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import is_dataclass
 from functools import cache, reduce
 from operator import getitem
+from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
@@ -26,10 +29,6 @@ from xrgs.splat.backend import CHOICES
 from xrgs.splat.settings import NOMINAL_STEPS, SPLITS, STARTS, STRATEGIES
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
-    from pathlib import Path
-    from types import ModuleType
-
     from omegaconf import DictConfig
 
 

@@ -7,16 +7,13 @@ module. `xrgs.composing` makes configs.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, is_dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import Field, dataclass, field, fields, is_dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_type_hints
+from typing import Any, get_type_hints
 
 from xrgs.splat.settings import DensifySettings, OptimizerSettings, RasterSettings
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-    from dataclasses import Field
 
 _PACKAGE = Path(__file__).parent
 #: Folder of the config's files: inside the package in a wheel, next to it in a checkout.

@@ -12,25 +12,22 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from xrgs.bench import loads
+from xrgs.bench.loads import Load
 from xrgs.errors import XrgsError
 from xrgs.runtime.progress import progress
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-
-    from numpy.typing import NDArray
-
-    from xrgs.bench.loads import Load
     from xrgs.bench.rendering import Row
 
-    #: (side, task, number of threads) -> time of each repetition, ms.
     Durations = Mapping[tuple[str, str, int], NDArray[np.float64]]
 
 HR_SHARE = 0.3  # fraction of HR steps in a mixed-resolution training

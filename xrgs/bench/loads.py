@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from xrgs.errors import XrgsError
@@ -16,9 +17,6 @@ from xrgs.safeio import npz
 from xrgs.safeio.atomic import atomic_writer
 from xrgs.splat.cameras import Camera
 from xrgs.splat.loss import WINDOW
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 #: Standard deviation of a random Gaussian over the mean distance between Gaussians in the image.
 #: With this value, about 40 Gaussians contribute to a pixel, for any number and image size.

@@ -3,27 +3,22 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib import style
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 from scipy.stats import linregress
 
-from xrgs.bench.rendering import TORCH_FLOAT64, total_ms
+from xrgs.bench.rendering import TORCH_FLOAT64, Row, total_ms
 from xrgs.bench.training import STEP_PARTS
 from xrgs.photos.images import SOFTWARE
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    from matplotlib.axes import Axes
-
-    from xrgs.bench.rendering import Row
 
 _DPI = 150
 _SIZE = (4.6, 4.2)  # of a panel, inches

@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from statistics import median
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
+from xrgs.bench.loads import Load
 from xrgs.splat.gaussians import ActivatedGaussians
 from xrgs.splat.rendering import Render, rasterize_parameters
 from xrgs.splat.settings import CullingOptions, RasterSettings
 from xrgs.splat.sh import bases
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
-
-    from xrgs.bench.loads import Load
 
 #: Width and height of the part of a view that is compared with a render in float64, px. A whole
 #: large view would take minutes in float64.

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 
 from xrgs.bench import against, loads, plot, rendering, tables, training
+from xrgs.bench.loads import Load
+from xrgs.bench.rendering import Row
+from xrgs.bench.settings import Settings
 from xrgs.errors import XrgsError
 from xrgs.runtime.machine import usable_cores
 from xrgs.runtime.progress import progress
@@ -16,13 +20,6 @@ from xrgs.safeio.records import table_text
 from xrgs.safeio.sanitize import for_csv
 from xrgs.splat.backend import resolve_backend
 from xrgs.store import provenance
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from xrgs.bench.loads import Load
-    from xrgs.bench.rendering import Row
-    from xrgs.bench.settings import Settings
 
 
 class BenchmarkSizes(NamedTuple):

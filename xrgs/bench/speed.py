@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
+from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING
 
 from xrgs.bench.loads import random_load
 from xrgs.bench.training import TrainingStep
+from xrgs.config import Conf
 from xrgs.mixture import variant
 from xrgs.runtime.machine import set_torch_threads
 from xrgs.splat.backend import resolve_backend
 from xrgs.training import dataset
 from xrgs.training.loop import train
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from xrgs.config import Conf
 
 #: Size of the load's view, px, and number of Gaussians: half a Gaussian per pixel, as after
 #: training.

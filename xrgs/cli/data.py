@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -24,9 +25,6 @@ from xrgs.safeio.paths import user_path
 from xrgs.store.cell_folder import IDENTITY, CellFolder
 from xrgs.store.export import SPLAT_FORMATS
 from xrgs.store.store import Store
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

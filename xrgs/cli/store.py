@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
@@ -15,13 +16,9 @@ from xrgs.errors import XrgsError
 from xrgs.runtime.signals import exit_on_signal
 from xrgs.runtime.streams import say
 from xrgs.safeio.sanitize import counted
+from xrgs.store.listing import CellRow
 from xrgs.store.store import Store
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from xrgs.store.listing import CellRow
-    from xrgs.sweep.cleaning import Plan
+from xrgs.sweep.cleaning import Plan
 
 
 @dataclass(frozen=True)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import hydra
 from omegaconf import MISSING, DictConfig, OmegaConf
@@ -20,9 +21,6 @@ from xrgs.composing import escape_interpolations
 from xrgs.runtime.signals import exit_on_signal
 from xrgs.runtime.streams import guard_streams, say
 from xrgs.safeio.paths import user_path
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
 
 #: With this environment variable Hydra leaves errors to its caller.
 _FULL_ERROR = "HYDRA_FULL_ERROR"

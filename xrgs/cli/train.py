@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import shlex
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -21,6 +22,7 @@ from xrgs.cli import budget, options, sweep
 from xrgs.cli.data import as_they_are, form_of, last_of_each_key, write_export
 from xrgs.cli.options import STORE, Flag, Folder, OptionalFolder, shown_as
 from xrgs.cli.overrides import check_no_axis, explained, with_quotes
+from xrgs.config import Conf
 from xrgs.errors import StoreError, XrgsError
 from xrgs.photos import scenes
 from xrgs.runtime.machine import usable_cores
@@ -29,15 +31,12 @@ from xrgs.runtime.streams import say
 from xrgs.runtime.text import format_duration
 from xrgs.safeio.sanitize import counted, for_line
 from xrgs.splat.settings import NOMINAL_STEPS
+from xrgs.store.cell_folder import CellFolder
+from xrgs.store.inspect import Mixture, SfmReport
 from xrgs.store.store import BASELINE, Store
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from xrgs.bench.speed import Trial
-    from xrgs.config import Conf
-    from xrgs.store.cell_folder import CellFolder
-    from xrgs.store.inspect import Mixture, SfmReport
 
 #: --quality -> its overrides.
 _QUALITIES = {

@@ -6,35 +6,31 @@ A cell that is not done becomes a row with its state and the reason, so that a r
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
+from pathlib import Path
 from statistics import fmean
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 import numpy as np
 import pandas as pd
 
 from xrgs.composing import dotted
+from xrgs.config import Conf
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.evaluation.metrics import METRICS, ON_REQUEST, VIEW_METRICS
 from xrgs.runtime.progress import progress
 from xrgs.safeio.sanitize import for_file_name, for_line
-from xrgs.store.cell_folder import CellState, number_columns
+from xrgs.store.cell_folder import CellFolder, CellState, number_columns
+from xrgs.store.inspect import SfmReport
 from xrgs.store.provenance import machine
 from xrgs.store.results import over_views
+from xrgs.store.schema import Identity, Provenance, RecordedCell, Status, Summary
 from xrgs.store.scoring import PROTOCOL, stale_scores, without_refactorings
 from xrgs.store.store import BASELINE, Store
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-    from pathlib import Path
-
-    from xrgs.config import Conf
-    from xrgs.store.cell_folder import CellFolder
-    from xrgs.store.inspect import SfmReport
-    from xrgs.store.schema import Identity, Provenance, RecordedCell, Status, Summary
 
 #: The columns of a sweep's record, which has a row for each planned cell.
 RECORD_KEYS = [
@@ -371,8 +367,7 @@ class ReportStore(Store):
         """Folders of another program's renders, see `Sweep.renders`."""
 
     def render(self, cell_id: str, view: str) -> Path:
-        """Return the file of a view's render, which need not exist; StoreError if it was trimmed.
-        """
+        """Return the file of a view's render, which need not exist; StoreError if it is trimmed."""
         if cell_id in self.external:
             return self.external[cell_id] / f"{view}.png"
         cell, name = self.cell(cell_id), f"renders/{view}.png"

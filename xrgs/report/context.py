@@ -2,28 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 
+from xrgs.config import Conf, VariantConf
 from xrgs.errors import StoreError
 from xrgs.mixture.degradations import DEGRADATIONS, resolve_degradation
+from xrgs.report.collect import ReportStore, Sweep
+from xrgs.report.compare import Comparison
 from xrgs.report.inference import OTHER_CODE
 from xrgs.report.writing import signed
 from xrgs.runtime.text import listed
 from xrgs.safeio.sanitize import counted, for_line
 from xrgs.store.inspect import SfmReport, read_report
+from xrgs.store.schema import Provenance
 from xrgs.store.trimming import home_of
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-
-    from xrgs.config import Conf, VariantConf
-    from xrgs.report.collect import ReportStore, Sweep
-    from xrgs.report.compare import Comparison
-    from xrgs.store.schema import Provenance
 
 #: Scores of fewer views than this say little: one more view may reverse their order.
 _ENOUGH_VIEWS = 3

@@ -6,18 +6,13 @@ A cell trained with `train.evaluate_every=N` has the mean scores of its test vie
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Mapping, Sequence
 
 import pandas as pd
 
-from xrgs.report.collect import CELL_KEYS, CURVE_COLUMNS
+from xrgs.report.collect import CELL_KEYS, CURVE_COLUMNS, DoneCell
 from xrgs.report.markup import titled
 from xrgs.runtime.text import TextTable
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-
-    from xrgs.report.collect import DoneCell
 
 _NOT_REACHED = "not reached"
 

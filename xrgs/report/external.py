@@ -8,8 +8,10 @@ and memory (`Figures`).
 
 from __future__ import annotations
 
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Any
+from pathlib import Path
+from typing import Annotated, Any
 
 import msgspec
 import pandas as pd
@@ -19,7 +21,7 @@ from xrgs.evaluation.files import score_file
 from xrgs.evaluation.metrics import VIEW_METRICS
 from xrgs.mixture import variant
 from xrgs.photos.images import ImageError
-from xrgs.report.collect import ReportError, Sweep
+from xrgs.report.collect import ReportError, ReportStore, Sweep
 from xrgs.runtime.progress import progress
 from xrgs.safeio.files import is_inside
 from xrgs.safeio.paths import user_path
@@ -27,12 +29,6 @@ from xrgs.safeio.records import read_struct
 from xrgs.safeio.sanitize import for_file_name
 from xrgs.store.results import over_views
 from xrgs.store.scoring import scoring_code
-
-if TYPE_CHECKING:
-    from collections.abc import Hashable, Mapping, Sequence
-    from pathlib import Path
-
-    from xrgs.report.collect import ReportStore
 
 #: Another program's renders become one row for each combination of these columns.
 _VARIANT = ["scene", "condition", "variant_seed"]

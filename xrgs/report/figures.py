@@ -9,30 +9,26 @@ from __future__ import annotations
 
 import io
 import warnings
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 from matplotlib import style
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import EngFormatter, LogLocator, NullLocator
+from numpy.typing import NDArray
 
+from xrgs.evaluation.metrics import Metric
 from xrgs.photos.images import SOFTWARE
 from xrgs.report.writing import named
 from xrgs.safeio.sanitize import MAX_CELL, for_line
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-
-    import pandas as pd
-    from matplotlib.axes import Axes
-    from matplotlib.lines import Line2D
-    from numpy.typing import NDArray
-
-    from xrgs.evaluation.metrics import Metric
-
-    Image = NDArray[np.float32]
+Image = NDArray[np.float32]
 
 #: Okabe and Ito's orange and blue, which colour-blind readers can distinguish, also in grey.
 _ABLATION, _BASELINE, _FRAME = "#D55E00", "#0072B2", "#FFD400"

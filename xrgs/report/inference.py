@@ -6,15 +6,11 @@ can't be computed is NaN. Changes of pairs come with the reason why they can't b
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import bdtr, stdtr, stdtrit
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Floats = NDArray[np.float64]
+Floats = NDArray[np.float64]
 
 CONFIDENCE = 0.95
 #: The fewest values behind a mean with a verdict or a test; our choice. Two values show too little

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import pandas as pd
 
 from xrgs.evaluation.metrics import METRICS
 from xrgs.mixture.paths import TO_TRY
@@ -21,9 +23,9 @@ from xrgs.report.collect import (
     read_cells,
     report_name,
 )
-from xrgs.report.compare import Design, compare
+from xrgs.report.compare import Comparison, Design, compare
 from xrgs.report.context import contexts, decided_by_one_view, photographs, with_variants
-from xrgs.report.external import with_external
+from xrgs.report.external import External, with_external
 from xrgs.report.html import write_document
 from xrgs.report.markup import latex_file, to_markdown
 from xrgs.report.paper import paper_tables, texture_tables, why_no_table, with_texture
@@ -36,14 +38,6 @@ from xrgs.safeio.sanitize import counted, for_csv, for_file_name, for_line, for_
 from xrgs.store.provenance import MACHINE_KEYS, without_threads
 from xrgs.store.scoring import PROTOCOL
 from xrgs.store.store import BASELINE
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    import pandas as pd
-
-    from xrgs.report.compare import Comparison
-    from xrgs.report.external import External
 
 #: The page of a report.
 PAGE = "report.html"

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
 from xrgs.errors import StoreError
+from xrgs.evaluation.metrics import Metric
 from xrgs.report.averages import averaged
-from xrgs.report.compare import is_ratio
+from xrgs.report.collect import ReportStore
+from xrgs.report.compare import Comparison, is_ratio
 from xrgs.report.context import Context
 from xrgs.report.inference import MIN_VALUES, log_ratio
 from xrgs.report.markup import filled, titled
 from xrgs.report.writing import (
+    Change,
     by_key,
     interval,
     lacking,
@@ -29,14 +33,6 @@ from xrgs.runtime.text import TextTable, listed
 from xrgs.safeio.sanitize import counted
 from xrgs.store.store import BASELINE
 from xrgs.store.trimming import home_of, textures
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Mapping, Sequence
-
-    from xrgs.evaluation.metrics import Metric
-    from xrgs.report.collect import ReportStore
-    from xrgs.report.compare import Comparison
-    from xrgs.report.writing import Change
 
 #: Labels of the full XR-GS; each reads section 5.4 of the paper in another way.
 _READINGS = ("xrgs", "xrgs_per_class", "xrgs_own_threshold")

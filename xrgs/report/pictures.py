@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from xrgs.errors import StoreError, UnreadableError
 from xrgs.photos import images
 from xrgs.photos.images import ImageError
-from xrgs.report.collect import ReportError
-from xrgs.report.compare import is_ratio, run_name
+from xrgs.report.collect import ReportError, ReportStore
+from xrgs.report.compare import Comparison, is_ratio, run_name
 from xrgs.report.curves import means_over_runs, means_over_scenes
 from xrgs.report.figures import (
     MAX_ARMS,
@@ -33,16 +35,7 @@ from xrgs.safeio.atomic import atomic_writer
 from xrgs.safeio.sanitize import for_file_name
 from xrgs.store.trimming import check_images
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from xrgs.report.collect import ReportStore
-    from xrgs.report.compare import Comparison
-
-    _Drawing = Callable[[Path], "Picture"]  # draws into the file
+_Drawing = Callable[[Path], "Picture"]  # draws into the file
 
 #: The scores in figures over training time.
 _QUALITY = ("psnr", "lpips")

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 
+from xrgs.evaluation.metrics import Metric
+from xrgs.report.compare import Comparison
 from xrgs.report.context import Context
 from xrgs.report.inference import ALL_HR
 from xrgs.report.markup import filled, titled
@@ -32,12 +34,6 @@ from xrgs.report.writing import (
     with_unit,
 )
 from xrgs.runtime.text import TextTable
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from xrgs.evaluation.metrics import Metric
-    from xrgs.report.compare import Comparison
 
 #: Metrics that differ between two runs of the same training.
 _NOISY = frozenset({"training_time_s", "render_time_ms", "peak_rss_bytes"})

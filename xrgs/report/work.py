@@ -8,18 +8,14 @@ from its summary. The cost of skipped work is estimated from the same run's tota
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 import pandas as pd
 
-from xrgs.report.collect import CELL_KEYS, is_component_log
+from xrgs.report.collect import CELL_KEYS, DoneCell, is_component_log
 from xrgs.report.markup import titled
 from xrgs.runtime.text import TextTable
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-
-    from xrgs.report.collect import DoneCell
 
 _LABELS = {
     "steps_HR": "Steps on HR views",

@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import math
 import re
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
-from xrgs.report.compare import is_ratio
+import pandas as pd
+
+from xrgs.evaluation.metrics import Metric
+from xrgs.report.compare import Comparison, is_ratio
 from xrgs.report.inference import LEVEL, MIN_VALUES
 from xrgs.runtime.text import TextTable
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    import pandas as pd
-
-    from xrgs.evaluation.metrics import Metric
-    from xrgs.report.compare import Comparison
 
 #: Arrows mean improvement and degradation, as in the paper's tables: fewer Gaussians are `↑`.
 BETTER, WORSE, SAME = "↑", "↓", "="
@@ -179,10 +175,9 @@ def interval(low: float, high: float) -> str:
 
 
 def same_sign(row: Change) -> str:
-    """Write how many values have the sign of their mean, and the p of the sign test: `4 of 4
-    (0.125)`.
+    """Write how many values have the sign of their mean, and the p of the sign test.
 
-    It is empty for fewer than two values.
+    It is `4 of 4 (0.125)`, and empty for fewer than two values.
     """
     return f"{row.agree} of {row.n} ({p_value(row.p_sign)})" if row.n > 1 else ""
 

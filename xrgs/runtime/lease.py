@@ -26,19 +26,16 @@ import secrets
 import socket
 import threading
 import time
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from enum import Enum
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import msgspec
 
 from xrgs.runtime import machine
 from xrgs.safeio.files import read_bytes
 from xrgs.safeio.sanitize import for_line
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
 
 _log = logging.getLogger(__name__)
 

@@ -16,10 +16,11 @@ import re
 import shutil
 import stat
 import tarfile
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import PurePath
-from typing import TYPE_CHECKING, Any
+from pathlib import Path, PurePath
+from typing import Any
 
 import msgspec
 
@@ -37,13 +38,7 @@ from xrgs.store import trimming
 from xrgs.store.cell_folder import CONFIG, NOT_RESULTS, STATUS, CellFolder, CellState
 from xrgs.store.identity import cell_id
 from xrgs.store.schema import FileEntry
-from xrgs.store.store import unchanged_record
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
-    from pathlib import Path
-
-    from xrgs.store.store import Store
+from xrgs.store.store import Store, unchanged_record
 
 #: The folder in the archive; the default of `store=`, so that commands find it once it is unpacked.
 _ROOT = "xrgs-store"
@@ -199,8 +194,7 @@ _REQUIRED = ("config.json", "identity.json", "provenance.json", "summary.json", 
 
 
 def import_store(source: Path, store: Store) -> Copied:
-    """Copy a store of somebody else, an archive or a folder, into one's own, after every file is
-    checked.
+    """Copy a store of somebody else, an archive or a folder, after every file is checked.
 
     Cells that are not done, checkpoints, logs and reports are not imported. Each cell, variant,
     scene and record gets its name once it is whole and on the disk. An import that was stopped goes

@@ -8,11 +8,14 @@ present and unchanged.
 from __future__ import annotations
 
 import stat
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import msgspec
 
+from xrgs.config import Conf
 from xrgs.errors import StoreError, UnreadableError
 from xrgs.runtime import progress
 from xrgs.safeio.atomic import write_json, write_text
@@ -23,12 +26,8 @@ from xrgs.safeio.sanitize import for_terminal
 from xrgs.store.schema import FileEntry, Identity, Provenance, Status, Summary
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-    from pathlib import Path
-
     import pandas as pd
 
-    from xrgs.config import Conf
     from xrgs.mixture.views import Variant
     from xrgs.splat.cameras import Camera
     from xrgs.splat.gaussians import Gaussians

@@ -12,17 +12,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from xrgs.errors import XrgsError
+from xrgs.mixture.views import Variant
 from xrgs.safeio.atomic import write_json, write_text
 from xrgs.safeio.files import list_names
 from xrgs.store.cell_folder import CellFolder
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from xrgs.mixture.colmap import PinholeImage
-    from xrgs.mixture.views import Variant
     from xrgs.splat.gaussians import Gaussians
     from xrgs.training.dataset import Dataset, LoadedView
 
@@ -75,8 +74,7 @@ def export(path: Path, layout: str, out: Path) -> str:
 
 
 def export_splats(path: Path, form: str, out: Path) -> str:
-    """Write the Gaussians of a cell, or of a .ply, .glb or .spz file, to one file of a
-    `SPLAT_FORMATS`.
+    """Write the Gaussians of a cell, or of a .ply, .glb or .spz file, to a .ply, .glb or .spz file.
 
     They stay in the normalised world of training. A .glb of a cell is shown with the cameras' mean
     up direction upwards. A line with the number of Gaussians is returned.
@@ -128,9 +126,7 @@ def _shown(cell: CellFolder) -> Gaussians:
 
 
 def transform(variant: Variant) -> NDArray[np.float64]:
-    """Return the similarity [4, 4] from the world of SfM, or of given poses, to the world of
-    training.
-    """
+    """Return the similarity [4, 4] from the world of SfM or of given poses to that of training."""
     from xrgs.splat.normalize import normalize_scene
 
     posed = [view.viewmat for view in variant.views if view.split != "original"]

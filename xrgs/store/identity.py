@@ -21,12 +21,11 @@ the identity does not tell them apart. For the gsplat backend it has the version
 from __future__ import annotations
 
 from functools import cache
-from typing import TYPE_CHECKING
 
 import msgspec
 
 from xrgs import plugins
-from xrgs.config import identity_values
+from xrgs.config import Conf, identity_values
 from xrgs.registry import BUILT_IN, file_of, order_of
 from xrgs.safeio.code import CodeFolders, code_digest
 from xrgs.safeio.hashing import digest
@@ -34,9 +33,6 @@ from xrgs.safeio.refactorings import ABSENT, canonical
 from xrgs.splat.backend import arithmetic, check_raster, resolve_backend
 from xrgs.splat.settings import STRATEGIES
 from xrgs.store.schema import Identity
-
-if TYPE_CHECKING:
-    from xrgs.config import Conf
 
 #: The code that trains. The files of backends, the dense start, strategies and components count
 #: where these are on; every other file counts always.

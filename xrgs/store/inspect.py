@@ -6,8 +6,9 @@ Nothing here imports torch.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from msgspec import Struct, structs
@@ -16,7 +17,8 @@ from PIL import Image, ImageDraw, ImageFont
 from xrgs.errors import UnreadableError, XrgsError
 from xrgs.mixture import variant
 from xrgs.mixture.paths import is_failed
-from xrgs.mixture.saved_variant import REPORT, Manifest, read_manifest
+from xrgs.mixture.saved_variant import REPORT, Manifest, ViewEntry, read_manifest
+from xrgs.mixture.views import Variant, View
 from xrgs.photos import images
 from xrgs.photos.images import ImageError
 from xrgs.runtime.progress import progress
@@ -24,13 +26,6 @@ from xrgs.runtime.text import TextTable, listed, to_text
 from xrgs.safeio.atomic import atomic_writer
 from xrgs.safeio.records import read_struct
 from xrgs.safeio.sanitize import MAX_CELL, for_line
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
-
-    from xrgs.mixture.saved_variant import ViewEntry
-    from xrgs.mixture.views import Variant, View
-
 
 #: Two views count as taken by one camera where the angle between them, in degrees, and the
 #: distance, as a share of the cameras' extent, are at most these. SfM placed the copies of two sets

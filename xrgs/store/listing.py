@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import time
 from collections import Counter
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
@@ -18,13 +20,10 @@ from xrgs.runtime.text import listed
 from xrgs.safeio.files import file_bytes
 from xrgs.splat.backend import arithmetic
 from xrgs.store.identity import changed_code
+from xrgs.store.schema import Identity, RecordedCell, SweepRecord
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
-    from pathlib import Path
-
     from xrgs.store.cell_folder import CellFolder, CellState
-    from xrgs.store.schema import Identity, RecordedCell, SweepRecord
 
 #: The states that a cell of a store can have.
 STATES = ("done", "running", "planned", "unfinished", "failed", "corrupt")

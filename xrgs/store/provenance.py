@@ -5,11 +5,12 @@ from __future__ import annotations
 import platform
 import re
 import sys
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import xrgs
 from xrgs.evaluation.lpips import weights
@@ -18,9 +19,6 @@ from xrgs.safeio.records import read_struct
 from xrgs.splat.backend import arithmetic, device
 from xrgs.store import commit
 from xrgs.store.schema import Provenance
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 _PACKAGES = ("torch", "numpy", "pycolmap", "kornia", "scikit-image", "hydra-core", "pandas")
 #: The fields that a cell's times depend on, apart from the program.
@@ -46,8 +44,7 @@ def _instruction_set(backend: str) -> str | None:
 
 
 def collect(threads: int, backend: str) -> Provenance:
-    """Return the program, its libraries, the machine and the time, for a cell's threads and
-    backend.
+    """Return the program, its libraries, the machine and the time.
 
     Raises:
         WeightsError: The weights of LPIPS on this machine are not the published ones. A cell that

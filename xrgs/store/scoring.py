@@ -6,8 +6,8 @@ views for them. A new or changed metric makes the scores stale, but not the trai
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from functools import cache
-from typing import TYPE_CHECKING
 
 from xrgs.errors import StoreError, XrgsError
 from xrgs.evaluation.metrics import METRICS, ON_REQUEST, VIEW_METRICS, also_scored
@@ -19,13 +19,9 @@ from xrgs.safeio.hashing import file_digest
 from xrgs.safeio.records import table_text
 from xrgs.safeio.refactorings import canonical
 from xrgs.safeio.sanitize import counted, for_line
+from xrgs.store.cell_folder import CellFolder
 from xrgs.store.identity import changed_code
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from xrgs.store.cell_folder import CellFolder
-    from xrgs.store.store import Store
+from xrgs.store.store import Store
 
 #: The key of the protocol among the digests of scores.
 PROTOCOL = "protocol"

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import stat
 import tempfile
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,16 +29,11 @@ from xrgs.safeio.records import list_folder, read_struct
 from xrgs.safeio.sanitize import for_line
 from xrgs.store import listing
 from xrgs.store.cell_folder import IDENTITY, CellFolder, CellState
-from xrgs.store.listing import modified
-from xrgs.store.schema import SweepRecord
+from xrgs.store.listing import CellRow, SweepRow, modified
+from xrgs.store.schema import RecordedCell, SweepRecord
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
     import pandas as pd
-
-    from xrgs.store.listing import CellRow, SweepRow
-    from xrgs.store.schema import RecordedCell
 
 
 #: Label of the cells that all others are compared to.

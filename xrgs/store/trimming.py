@@ -16,15 +16,18 @@ scenes and the baseline better on simple ones, and does not say how texture is m
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 from msgspec import Struct
+from numpy.typing import NDArray
 
+from xrgs.config import SceneConf, VariantConf
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.mixture import poses, saved_variant
 from xrgs.mixture.paths import id_of, is_trimmed, trimmed_folder
-from xrgs.mixture.photographs import prepare_hr_views, write_degraded
+from xrgs.mixture.photographs import PhotoCollection, prepare_hr_views, write_degraded
 from xrgs.photos import images, scenes
 from xrgs.photos.images import ImageError
 from xrgs.photos.lens import Lens
@@ -34,15 +37,6 @@ from xrgs.safeio import checksums
 from xrgs.safeio.atomic import write_json
 from xrgs.safeio.files import file_bytes, remove_path, sync_name, sync_tree
 from xrgs.safeio.records import list_folder, read_struct
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from xrgs.config import SceneConf, VariantConf
-    from xrgs.mixture.photographs import PhotoCollection
 
 _IMAGES = "images"
 #: The file of a trimmed variant with the texture of each view, by its split and name: `test/a`.

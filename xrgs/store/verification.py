@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import stat
 import time
+from collections.abc import Callable, Iterator
 from functools import partial
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from xrgs.errors import StoreError
 from xrgs.mixture import paths, variant
@@ -16,15 +17,9 @@ from xrgs.safeio.files import walk_files
 from xrgs.safeio.records import list_folder
 from xrgs.safeio.sanitize import for_line
 from xrgs.store import trimming
-from xrgs.store.store import unchanged_record
+from xrgs.store.store import Store, unchanged_record
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from pathlib import Path
-
-    from xrgs.store.store import Store
-
-    _Checks = Iterator[tuple[Path, Callable[[], list[str]]]]
+_Checks = Iterator[tuple[Path, Callable[[], list[str]]]]
 
 
 def verify(store: Store) -> tuple[str, list[str]]:

@@ -4,23 +4,18 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal
-from typing import TYPE_CHECKING
 
+from hydra.core.config_loader import ConfigLoader
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import ChoiceSweep, Quote, QuotedString
+from hydra.core.override_parser.types import ChoiceSweep, Override, Quote, QuotedString
 from omegaconf.errors import OmegaConfBaseException
 
 from xrgs.config import GROUPS
 from xrgs.errors import XrgsError
 from xrgs.store.store import BASELINE
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from hydra.core.config_loader import ConfigLoader
-    from hydra.core.override_parser.types import Override
 
 
 @dataclass(frozen=True)

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import shlex
 import threading
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
-from xrgs.config import CONF_DIR
+from xrgs.config import CONF_DIR, Conf, SceneConf, VariantConf
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.mixture import photographs, split, variant
 from xrgs.mixture.degradations import DEGRADATIONS, resolve_degradation
@@ -24,14 +25,8 @@ from xrgs.safeio.files import is_transient
 from xrgs.safeio.sanitize import counted
 from xrgs.store import trimming
 from xrgs.store.inspect import read_report
-from xrgs.store.store import StoreGoneError
+from xrgs.store.store import Store, StoreGoneError
 from xrgs.sweep import job
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
-
-    from xrgs.config import Conf, SceneConf, VariantConf
-    from xrgs.store.store import Store
 
 _Result = TypeVar("_Result")
 #: Memory that a build may take; fern and flower take 0.6 GB each at 500 px.

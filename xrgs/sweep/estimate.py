@@ -13,23 +13,19 @@ from contextlib import suppress
 from dataclasses import asdict, astuple, dataclass
 from datetime import datetime
 from functools import cache
+from pathlib import Path
 from statistics import fmean, median
-from typing import TYPE_CHECKING
 
 from xrgs.composing import dotted
+from xrgs.config import Conf
 from xrgs.errors import StoreError, XrgsError
 from xrgs.mixture import saved_variant
+from xrgs.mixture.saved_variant import ViewEntry
 from xrgs.splat.backend import resolve_backend
+from xrgs.store.cell_folder import CellFolder
 from xrgs.store.provenance import processor, this_processor
+from xrgs.store.store import Store
 from xrgs.store.trimming import home_of
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from xrgs.config import Conf
-    from xrgs.mixture.saved_variant import ViewEntry
-    from xrgs.store.cell_folder import CellFolder
-    from xrgs.store.store import Store
 
 #: Assumed Gaussians of a cell for each pixel of its largest view, mean over the steps, while the
 #: store has no finished cell. In least squares of 111 cells of 2,000 steps at 500 px on one thread

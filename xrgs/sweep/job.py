@@ -21,6 +21,7 @@ import sys
 import tempfile
 import time
 import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from itertools import cycle
@@ -30,6 +31,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from xrgs.config import Conf, LimitsConf
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.mixture.paths import trimmed_folder
 from xrgs.runtime import lease, machine
@@ -43,16 +45,12 @@ from xrgs.splat.backend import arithmetic
 from xrgs.store.attempts import begin_attempt
 from xrgs.store.cell_folder import LOG, CellFolder
 from xrgs.store.identity import changed_code
+from xrgs.store.schema import Identity
 from xrgs.store.store import Store
 from xrgs.sweep.session import SweepSession
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
-
     from omegaconf import DictConfig
-
-    from xrgs.config import Conf, LimitsConf
-    from xrgs.store.schema import Identity
 
 #: Outcomes of a job other than the states of a cell. LOCKED: another process trains the cell.
 #: STOPPED: the sweep is over, or no further job may begin. UNWRITABLE: the store can't be written.
@@ -147,8 +145,7 @@ def run_hydra_job(cfg: DictConfig) -> str:
 
 
 def run_job(session: SweepSession, store: Store, cell_id: str, name: str) -> str:
-    """Run one cell of a sweep, unless there is a reason not to; return its state or another
-    outcome.
+    """Run one cell of a sweep, unless there is a reason not to; return its outcome or its state.
 
     Raises:
         XrgsError: The installed code is not the planned one, or the variant of the cell is missing,

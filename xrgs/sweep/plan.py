@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
+from xrgs.config import Conf
 from xrgs.errors import XrgsError
 from xrgs.mixture.paths import TO_TRY
 from xrgs.mixture.split import check_variant_conf
@@ -17,19 +19,13 @@ from xrgs.splat.backend import resolve_backend
 from xrgs.splat.settings import SSIM_WINDOW
 from xrgs.store.cell_folder import CellState
 from xrgs.store.identity import cell_id, cell_identity
-from xrgs.store.schema import RecordedCell
-from xrgs.store.store import BASELINE
+from xrgs.store.schema import Identity, RecordedCell
+from xrgs.store.store import BASELINE, Store
 from xrgs.sweep import build_variants
-from xrgs.sweep.estimate import TORCH_SLOWDOWN
+from xrgs.sweep.estimate import TORCH_SLOWDOWN, Cost, CostEstimator
 
 if TYPE_CHECKING:
-    from collections.abc import Container, Iterable, Mapping, Sequence
-
-    from xrgs.config import Conf
-    from xrgs.store.schema import Identity
-    from xrgs.store.store import Store
     from xrgs.sweep.axes import CellSpec
-    from xrgs.sweep.estimate import Cost, CostEstimator
 
 #: The condition of cells that hold no view out.
 _ON_TRAINING_VIEWS = "scored on the training views"

@@ -9,13 +9,15 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 
 from xrgs import composing
+from xrgs.config import Conf
 from xrgs.errors import XrgsError
 from xrgs.runtime.machine import usable_cores
 from xrgs.runtime.progress import log_line
@@ -26,18 +28,13 @@ from xrgs.store import provenance
 from xrgs.store.attempts import begin_attempt, free_name, plan_cell
 from xrgs.store.cell_folder import CellFolder
 from xrgs.store.identity import cell_identity
+from xrgs.store.schema import Identity
 from xrgs.store.store import Store
 from xrgs.sweep import build_variants, job
 from xrgs.sweep.axes import CellSpec
 from xrgs.sweep.estimate import Cost
 from xrgs.sweep.monitor import SweepMonitor
 from xrgs.sweep.plan import PlannedCell
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-
-    from xrgs.config import Conf
-    from xrgs.store.schema import Identity
 
 #: Files of results that are compared byte for byte.
 _RESULTS = ("scores.csv", "history.csv", "splats.ply")

@@ -6,10 +6,11 @@ import shlex
 import sys
 import time
 from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import msgspec
 
@@ -22,15 +23,10 @@ from xrgs.runtime.text import TextTable, format_age, format_size, listed, to_tex
 from xrgs.safeio.files import file_bytes, is_name, walk_files
 from xrgs.safeio.records import list_folder
 from xrgs.safeio.sanitize import MAX_CELL, counted, for_file_name, for_line
-from xrgs.store.listing import STATES, latest_records
+from xrgs.store.cell_folder import CellFolder
+from xrgs.store.listing import STATES, CellRow, SweepRow, latest_records
 from xrgs.store.store import DEFAULT_STORE, Store
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-
-    from xrgs.store.cell_folder import CellFolder
-    from xrgs.store.listing import CellRow, SweepRow
-    from xrgs.sweep.plan import PlannedCell
+from xrgs.sweep.plan import PlannedCell
 
 _T = TypeVar("_T")
 #: The most cells, scenes or problems that are listed by name under one heading.

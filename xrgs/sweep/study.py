@@ -20,18 +20,22 @@ import re
 import sys
 import time
 from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
+from hydra.core.config_loader import ConfigLoader
 from hydra.core.plugins import Plugins
+from hydra.core.utils import JobReturn
 from hydra.errors import CompactHydraException
-from hydra.types import HydraContext
-from omegaconf import OmegaConf, flag_override
+from hydra.types import HydraContext, TaskFunction
+from omegaconf import DictConfig, OmegaConf, flag_override
 from omegaconf.errors import OmegaConfBaseException
 
 from xrgs.composing import escape_interpolations, to_conf
+from xrgs.config import Conf
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.evaluation.lpips import weights
 from xrgs.photos import scenes
@@ -62,16 +66,6 @@ from xrgs.sweep.monitor import SweepMonitor
 from xrgs.sweep.plan import PlannedCell
 from xrgs.sweep.session import SweepSession
 from xrgs.sweep.status import ending
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-
-    from hydra.core.config_loader import ConfigLoader
-    from hydra.core.utils import JobReturn
-    from hydra.types import TaskFunction
-    from omegaconf import DictConfig
-
-    from xrgs.config import Conf
 
 #: An override that sets a key to a number.
 _NUMBER = re.compile(r"([\w.]+)=((?:0|[1-9]\d*)(?:\.\d+)?)")

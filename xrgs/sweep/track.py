@@ -17,10 +17,12 @@ import math
 import os
 import threading
 import time
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any, Self
+from pathlib import Path
+from typing import Any, Self
 
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.evaluation.metrics import METRICS
@@ -29,16 +31,10 @@ from xrgs.runtime.progress import log_line
 from xrgs.safeio.atomic import write_json, write_text
 from xrgs.safeio.records import read_struct, read_table
 from xrgs.safeio.sanitize import for_csv, for_file_name, for_line
-from xrgs.store.cell_folder import number_columns
+from xrgs.store.cell_folder import CellFolder, number_columns
 from xrgs.store.listing import modified
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-    from pathlib import Path
-
-    from xrgs.store.cell_folder import CellFolder
-    from xrgs.store.store import Store
-    from xrgs.sweep.plan import PlannedCell
+from xrgs.store.store import Store
+from xrgs.sweep.plan import PlannedCell
 
 #: The values of each step by the names of their series: `history/<column>`, `quality/<score>`
 #: (during training) and `score/<metric>` (at the end).

@@ -6,7 +6,9 @@ the first test view, equals the scored render.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,16 +22,10 @@ from xrgs.safeio.atomic import atomic_writer
 from xrgs.safeio.files import list_names
 from xrgs.splat.cameras import Camera
 from xrgs.splat.rendering import rasterize
-from xrgs.viewer.models import reference
+from xrgs.viewer.models import Model, reference
 from xrgs.viewer.paths import PATHS, default_path
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
-    from pathlib import Path
-
-    from xrgs.viewer.models import Model
-
-    Frame = NDArray[np.uint8]  # [H, W, 3]
+Frame = NDArray[np.uint8]  # [H, W, 3]
 
 _MP4 = ".mp4"
 #: Smallest and largest side of a panel, px, and the most frames of a film.

@@ -12,6 +12,7 @@ import io
 import math
 import threading
 from collections import deque
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, redirect_stdout
 from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -23,20 +24,16 @@ from numpy.typing import NDArray
 
 from xrgs.errors import XrgsError
 from xrgs.safeio.sanitize import for_markdown
+from xrgs.splat.cameras import Camera
+from xrgs.splat.gaussians import Gaussians
 from xrgs.splat.quaternions import rotation_matrices
 from xrgs.splat.sh import sh_to_colors
 from xrgs.store.inspect import COLOURS
-from xrgs.viewer.models import reference
+from xrgs.viewer.models import Model, reference
 from xrgs.viewer.paths import look_at_point, up_direction
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
     from viser import CameraHandle, ClientHandle, ViserServer
-
-    from xrgs.splat.cameras import Camera
-    from xrgs.splat.gaussians import Gaussians
-    from xrgs.viewer.models import Model
 
     _Pose = dict[str, Any]  # by the names of _POSE
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -12,14 +13,12 @@ from xrgs.errors import StoreError, XrgsError
 from xrgs.formats.files import READERS, load_gaussians
 from xrgs.safeio.paths import user_path
 from xrgs.safeio.sanitize import for_line
+from xrgs.splat.cameras import Camera
+from xrgs.splat.gaussians import Gaussians
 from xrgs.splat.settings import RasterSettings
 from xrgs.viewer.paths import Poses
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from xrgs.splat.cameras import Camera
-    from xrgs.splat.gaussians import Gaussians
     from xrgs.store.cell_folder import CellFolder
     from xrgs.store.store import Store
 

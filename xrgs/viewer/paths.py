@@ -6,8 +6,8 @@ median distance of the cameras from the point that they look at. Cameras have Op
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +16,6 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from xrgs.errors import XrgsError
 from xrgs.splat.normalize import camera_positions
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 Array = NDArray[np.float64]
 

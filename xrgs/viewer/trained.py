@@ -6,31 +6,28 @@ torch: they call this module only for pages with pictures, and get plain numbers
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from xrgs.errors import XrgsError
+from xrgs.mixture.views import Variant
 from xrgs.splat.attribution import attribute_pixels
 from xrgs.splat.backend import resolve_backend
+from xrgs.splat.cameras import Camera
+from xrgs.splat.gaussians import ActivatedGaussians, Gaussians
 from xrgs.splat.rendering import rasterize
+from xrgs.splat.settings import RasterSettings
 from xrgs.splat.sh import C0
+from xrgs.store.cell_folder import CellFolder
 from xrgs.training import dataset
+from xrgs.training.dataset import Dataset, LoadedView
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-
-    from xrgs.mixture.views import Variant
-    from xrgs.splat.cameras import Camera
-    from xrgs.splat.gaussians import ActivatedGaussians, Gaussians
-    from xrgs.splat.settings import RasterSettings
-    from xrgs.store.cell_folder import CellFolder
-    from xrgs.training.dataset import Dataset, LoadedView
-
-    Image = NDArray[np.float32]  # [H, W, 3] 0..1
+Image = NDArray[np.float32]  # [H, W, 3] 0..1
 
 #: The number of shown training views of each tag.
 SHOWN_OF_A_TAG = 2

@@ -8,16 +8,20 @@ from __future__ import annotations
 
 import base64
 import hashlib
+from collections.abc import Iterator, Sequence
 from functools import cache
 from importlib import resources
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import pandas as pd
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
 from xrgs.errors import XrgsError
 from xrgs.evaluation.metrics import METRICS, VIEW_METRICS
 from xrgs.mixture import variant
+from xrgs.mixture.views import Variant
+from xrgs.report.collect import ReportStore, Sweep
 from xrgs.report.context import photographs, placement
 from xrgs.report.html.content import (
     Content,
@@ -34,20 +38,11 @@ from xrgs.report.html.content import (
 from xrgs.report.html.images import ERROR_RANGE, add_trained, add_views
 from xrgs.report.markup import filled, filled_places, titled, to_latex, to_markdown
 from xrgs.report.paper import counterparts
+from xrgs.report.tables import Tables
 from xrgs.report.writing import NO_INTERVAL, number, signed, with_unit
 from xrgs.runtime.text import TextTable, listed
 from xrgs.safeio.atomic import write_text
 from xrgs.safeio.sanitize import for_csv, for_line
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from pathlib import Path
-
-    from jinja2 import Template
-
-    from xrgs.mixture.views import Variant
-    from xrgs.report.collect import ReportStore, Sweep
-    from xrgs.report.tables import Tables
 
 #: The largest page, bytes, and its parts for test views, training views and models.
 MAX_BYTES = 10_000_000

@@ -8,32 +8,29 @@ from __future__ import annotations
 import base64
 import io
 import math
+from collections.abc import Sequence
 from itertools import islice
+from pathlib import Path
 from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 from matplotlib import colormaps
+from numpy.typing import NDArray
 from PIL import Image
 
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.evaluation.metrics import VIEW_METRICS
+from xrgs.mixture.views import Variant
 from xrgs.photos import images
 from xrgs.photos.images import ImageError
-from xrgs.report.html.content import finite, run_names, runs, shown, why
+from xrgs.report.collect import ReportStore
+from xrgs.report.compare import Comparison
+from xrgs.report.html.content import Content, finite, run_names, runs, shown, why
 from xrgs.runtime.progress import progress
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    import pandas as pd
-    from numpy.typing import NDArray
-
-    from xrgs.mixture.views import Variant
-    from xrgs.report.collect import ReportStore
-    from xrgs.report.compare import Comparison
-    from xrgs.report.html.content import Content
     from xrgs.viewer.trained import TrainedScene
 
 #: The largest longer side of an image on the page, px.
