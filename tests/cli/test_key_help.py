@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from xrgs.cli.key_help import explain
+from xrgs.cli.sweep import explain
 from xrgs.config import Conf, known_keys
 from xrgs.errors import XrgsError
 

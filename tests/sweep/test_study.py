@@ -27,10 +27,9 @@ from xrgs.sweep import build_variants
 from xrgs.sweep import plan as plan_module
 from xrgs.sweep import study as study_module
 from xrgs.sweep.axes import CellSpec
-from xrgs.sweep.job import FAIL_FAST, STOPPED, STORE_FULL
+from xrgs.sweep.job import FAIL_FAST, STOPPED, STORE_FULL, SweepSession
 from xrgs.sweep.monitor import SweepMonitor
 from xrgs.sweep.plan import PlannedCell, describe, record
-from xrgs.sweep.session import SweepSession
 from xrgs.sweep.study import Study, provide_lpips
 from xrgs.training.dataset import USES
 

@@ -64,11 +64,9 @@ class Load:
         return {"load": self.name, "gaussians": len(self), "width": width, "height": height}
 
     def downscaled(self, factor: int) -> Load:
-        """Return the same view at a lower resolution.
+        """Return the same view with width and height divided by a factor.
 
-        Args:
-            factor: Divisor of width and height, which are rounded down, but at least 11 px, the
-                side of the SSIM window.
+        They are rounded down, but at least 11 px, the side of the SSIM window.
         """
         camera = self.camera
         width, height = (max(WINDOW, side // factor) for side in (camera.width, camera.height))
@@ -89,15 +87,11 @@ class Load:
 def random_load(
     count: int, width: int, height: int, seed: int, size_per_spacing: float = _SIZE_PER_SPACING
 ) -> Load:
-    """Make anisotropic, mostly transparent Gaussians that fill the view and a little more.
+    """Make `count` anisotropic, mostly transparent Gaussians that fill the view and a little more.
 
-    Args:
-        count: Number of Gaussians.
-        width: Width of the view, px.
-        height: Height of the view, px.
-        seed: Seed of the random numbers.
-        size_per_spacing: Standard deviation of a Gaussian over the mean distance between Gaussians
-            in the image. The number of Gaussians that contribute to a pixel grows with its square.
+    `size_per_spacing` is the standard deviation of a Gaussian over the mean distance between
+    Gaussians in the image. The number of Gaussians that contribute to a pixel grows with its
+    square.
     """
     generator = torch.Generator().manual_seed(seed)
 
@@ -126,15 +120,11 @@ def random_load(
 
 
 def read(path: Path) -> Load:
-    """Read a load from a .npz file.
+    """Read a load from a .npz file with the arrays of `SHAPES`.
 
-    Args:
-        path: File with the arrays of `SHAPES`: `scales` in world units, `opacities` in 0..1,
-            `viewmat` from world to camera, and the other arrays as in `Load` and `Camera`.
-
-    Raises:
-        XrgsError: The file cannot be read, or an array is missing, of the wrong shape, not finite
-            or out of range. The message names the file and the array.
+    `scales` are in world units, `opacities` in 0..1, `viewmat` is from world to camera, and the
+    other arrays are as in `Load` and `Camera`. XrgsError names the file, and the array that is
+    missing, of the wrong shape, not finite or out of range.
     """
     try:
         with path.open("rb") as file:
@@ -174,11 +164,7 @@ def _check(key: str, value: NDArray[Any], shape: tuple[int | str, ...]) -> None:
 
 
 def write(path: Path, load: Load) -> None:
-    """Write a load as a .npz file for `read`.
-
-    Raises:
-        XrgsError: The file cannot be written.
-    """
+    """Write a load as a .npz file for `read`; XrgsError if it can't be written."""
     camera = load.camera
     tensors = {key: getattr(camera if key in {"viewmat", "K"} else load, key) for key in _TENSORS}
     arrays = {key: value.numpy() for key, value in tensors.items()}
@@ -192,8 +178,7 @@ def write(path: Path, load: Load) -> None:
 def load_from_cell(folder: Path, view_name: str) -> Load:
     """Make a load of a trained cell's Gaussians and one of its views.
 
-    Raises:
-        XrgsError: The cell isn't done, its variant isn't in the store, or it has no such view.
+    XrgsError says that the cell isn't done, its variant isn't in the store, or it has no such view.
     """
     from xrgs.store.cell_folder import CellFolder
 

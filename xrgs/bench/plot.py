@@ -28,11 +28,7 @@ _TIME = "forward + backward, ms"
 
 
 def draw(results: Mapping[str, Any]) -> bytes:
-    """Draw the plot of the results of `xrgs.bench.run`, with a panel for each question.
-
-    Returns:
-        The bytes of a PNG.
-    """
+    """Draw the plot of the results of `xrgs.bench.run`, a PNG with a panel for each question."""
     stream = io.BytesIO()
     draw_figure(results).savefig(stream, format="png", dpi=_DPI, metadata={"Software": SOFTWARE})
     return stream.getvalue()
@@ -154,11 +150,10 @@ ALL_LOADS = "all loads"
 def fit_growth(rows: Sequence[Row]) -> list[Row]:
     """Fit power laws to the times of the first method on one thread.
 
-    Returns:
-        A row for each growing quantity (`grows`: "Gaussians" or "pixels") and each size of the
-        other quantity (`at`), with `sizes` in ascending order, `ms` (forward plus backward), and
-        the `exponent` of the power law: 1 if doubling the size doubles the time. The last two rows
-        are for a fit to all loads. Quantities that do not vary have no rows.
+    Rows are for each growing quantity (`grows`: "Gaussians" or "pixels") and each size of the other
+    quantity (`at`), with `sizes` in ascending order, `ms` (forward plus backward), and the
+    `exponent` of the power law: 1 if doubling the size doubles the time. The last two rows are for
+    a fit to all loads. Quantities that do not vary have no rows.
     """
     frame = pd.DataFrame(rows)
     frame = frame[(frame["method"] == rows[0]["method"]) & (frame["threads"] == 1)]

@@ -126,13 +126,10 @@ class RenderTask:
 def time_load(
     load: Load, methods: Sequence[RenderMethod], counts: Sequence[int], repeats: int
 ) -> list[Row]:
-    """Time all methods on a load with each number of threads, and compute their errors.
+    """Time all methods on a load with each number of threads, and add the columns of `errors`.
 
     For large loads the torch backend is left out. For others it is timed at most twice, and its
     rows have `times_slower`, its time over that of the first native method.
-
-    Returns:
-        The rows of `time_methods`, with the columns of `errors` added.
     """
     fast = [method for method in methods if method.backend != "torch"]
     slow = [method for method in methods if method.backend == "torch"]
@@ -152,9 +149,8 @@ def time_methods(
 ) -> list[Row]:
     """Time each method with each number of threads, in turn.
 
-    Returns:
-        A row for each method and number of threads: sizes, shortest and median times (ms), speed-up
-        over the first number of threads, work, and memory (MiB).
+    Rows have sizes, shortest and median times (ms), speed-up over the first number of threads,
+    work, and memory (MiB).
     """
     tasks = {(m.name, count): RenderTask(load, m, count) for m in methods for count in counts}
     passes: dict[tuple[str, int, str], Callable[[], object]] = {}
@@ -289,8 +285,8 @@ def time_interleaved(
 ) -> dict[_Key, list[float]]:
     """Run each task once to warm up, then all tasks in turn (A B A B ...).
 
-    Returns:
-        Key -> duration of each run, ms.
+    In turn, so that other work on the machine slows down all tasks alike. Return the duration of
+    each run, ms, by the task's key.
     """
     for task in tasks.values():
         task()

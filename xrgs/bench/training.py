@@ -123,11 +123,10 @@ class TrainingStep:
 def time_steps(
     views: Mapping[str, Load], backend: str, counts: Sequence[int], repeats: int
 ) -> list[Row]:
-    """Time each part of a training step.
+    """Time each part of a training step, for each view and number of threads.
 
-    Returns:
-        A row for each view and number of threads: sizes, the time of each part and of the step
-        (`step_ms`), and the `speedup` over one thread.
+    Rows have sizes, the time of each part and of the step (`step_ms`), and the `speedup` over one
+    thread.
     """
     steps = {
         (view, count): TrainingStep(load, backend, count)
@@ -154,11 +153,8 @@ def time_steps(
 def time_shortcuts(load: Load, backend: str, repeats: int) -> list[Row]:
     """Time the shortcuts of a training step outside the renderer, on one thread.
 
-    They do not change a bit of the result.
-
-    Returns:
-        A row for each shortcut: `shortcut`, the `part` of the step, sizes, `on_ms`, `off_ms` and
-        `times` (time off over time on).
+    They do not change a bit of the result. Rows have the `shortcut`, the `part` of the step, sizes,
+    `on_ms`, `off_ms` and `times` (time off over time on).
     """
     pairs = {
         ("statistics of the photograph, once per view", "loss"): loss_gradients(load, backend),
@@ -208,10 +204,9 @@ def steps_of_sh_degrees(load: Load, backend: str) -> tuple[TrainingStep, Trainin
 def measure_memory(backend: str, gaussians: int, width: int, height: int, threads: int) -> Row:
     """Train a random load for a few steps in a new process and measure its memory.
 
-    Returns:
-        A row with the sizes and, in MiB: `counted_mib`, of parameters, gradients, Adam's state and
-        the renderer's buffers; `base_rss_mib`, resident memory before training; `peak_rss_mib`, its
-        maximum; and `growth_mib`, their difference. Without /proc there is only `counted_mib`.
+    The row has the sizes and, in MiB: `counted_mib`, of parameters, gradients, Adam's state and the
+    renderer's buffers; `base_rss_mib`, resident memory before training; `peak_rss_mib`, its
+    maximum; and `growth_mib`, their difference. Without /proc there is only `counted_mib`.
     """
     # A new process, since this one has already allocated memory for other loads. -P: does not
     # import a checkout in the current folder.

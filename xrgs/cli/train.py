@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import shlex
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -22,7 +21,6 @@ from xrgs.cli import budget, options, sweep
 from xrgs.cli.data import as_they_are, form_of, last_of_each_key, write_export
 from xrgs.cli.options import STORE, Flag, Folder, OptionalFolder, shown_as
 from xrgs.cli.overrides import check_no_axis, explained, with_quotes
-from xrgs.config import Conf
 from xrgs.errors import StoreError, XrgsError
 from xrgs.photos import scenes
 from xrgs.runtime.machine import usable_cores
@@ -31,12 +29,15 @@ from xrgs.runtime.streams import say
 from xrgs.runtime.text import format_duration
 from xrgs.safeio.sanitize import counted, for_line
 from xrgs.splat.settings import NOMINAL_STEPS
-from xrgs.store.cell_folder import CellFolder
-from xrgs.store.inspect import Mixture, SfmReport
 from xrgs.store.store import BASELINE, Store
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from xrgs.bench.speed import Trial
+    from xrgs.config import Conf
+    from xrgs.store.cell_folder import CellFolder
+    from xrgs.store.inspect import Mixture, SfmReport
 
 #: --quality -> its overrides.
 _QUALITIES = {
@@ -47,6 +48,18 @@ _QUALITIES = {
 #: Runs of at least _LONG_RUN steps have the settings of `preset=paper`. Shorter runs refine every
 #: _REFINED_EVERY steps, as `preset=laptop` does; more refinements grow more than they can train.
 _LONG_RUN, _REFINED_EVERY = 10_000, 50
+
+
+#: The longer sides of views to choose from, px. A size is worth it from 3,000 steps on at 504 px
+#: (`preset=laptop`); at other sizes in proportion to the number of pixels.
+_SIZES, _AT, _STEPS = (252, 378, 504, 756, 1008), 504, 3000
+#: The fewest steps, whatever the time, and the most, those of the paper.
+_LEAST, _MOST = 200, 30_000
+#: Guesses for unknown views: height over width, and rendered pixels plus Gaussians for each pixel.
+_ASPECT, _UNITS_OF_A_PIXEL = 0.7, 1.5
+#: The share of the whole time for training, before the time for the cameras is known; the share of
+#: the remaining time afterwards; and the seconds for scores and page.
+_TRAINING, _OF_THE_REST, _ENDING_S = 0.6, 0.95, 15.0
 
 
 @dataclass(frozen=True)
@@ -216,6 +229,34 @@ def _recipe(names: str) -> list[str]:
     if names == BASELINE:
         return []
     return [f"+ablation=[{names}]" if "," in names else f"+ablation={names}", "baseline=false"]
+
+
+def size_for(seconds: float, unit: float) -> int:
+    """Return the longer side of the views, px, for a time that includes finding the cameras.
+
+    Args:
+        seconds: The time of the whole command, s.
+        unit: Seconds per step for each rendered pixel and each Gaussian.
+    """
+    fitting = [
+        size
+        for size in _SIZES
+        if _STEPS * (size / _AT) ** 2 * _ASPECT * size**2 * _UNITS_OF_A_PIXEL * unit
+        <= _TRAINING * seconds
+    ]
+    return max(fitting, default=_SIZES[0])
+
+
+def steps_for(seconds: float, step_s: float) -> int:
+    """Return how many steps fit into the remaining time, to two digits.
+
+    Args:
+        seconds: The remaining time of the command, s.
+        step_s: Seconds per step.
+    """
+    count = int((_OF_THE_REST * seconds - _ENDING_S) / step_s)
+    digits: int = 10 ** max(0, len(str(max(count, 0))) - 2)
+    return min(_MOST, max(_LEAST, count // digits * digits))
 
 
 def _measured_unit(conf: Conf) -> float:

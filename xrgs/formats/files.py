@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from xrgs.errors import XrgsError
 from xrgs.formats.glb import read_glb, write_glb
 from xrgs.formats.ply import read_ply, save_ply
-from xrgs.formats.saved import check_is_read
+from xrgs.formats.saved import SavedGaussians, check_is_read
 from xrgs.formats.spz import read_spz, write_spz
+from xrgs.splat.gaussians import Gaussians
 from xrgs.splat.torch_defaults import on_cpu_in_float32
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from xrgs.formats.saved import SavedGaussians
-    from xrgs.splat.gaussians import Gaussians
-
 
 #: Suffix of a file -> function that reads it. `save_gaussians` writes all these formats.
 READERS: dict[str, Callable[[Path], SavedGaussians]] = {

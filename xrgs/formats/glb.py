@@ -15,9 +15,12 @@ from __future__ import annotations
 import json
 import math
 import struct
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from xrgs.errors import XrgsError
@@ -30,20 +33,12 @@ from xrgs.formats.saved import (
 )
 from xrgs.formats.similarity import transformed
 from xrgs.safeio.atomic import atomic_writer
-from xrgs.splat.gaussians import PARAMETERS
+from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.splat.normalize import rotation_between
 from xrgs.splat.sh import C0, MAX_DEGREE, bases
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from xrgs.splat.gaussians import Gaussians
-
-    Array = NDArray[Any]
-    Json = dict[str, Any]
+Array = NDArray[Any]
+Json = dict[str, Any]
 
 EXTENSION = "KHR_gaussian_splatting"
 _READ_EXTENSIONS = {EXTENSION, "KHR_mesh_quantization"}  # supported ones

@@ -7,9 +7,10 @@ instead. Unsupported arguments raise an error that names them.
 from __future__ import annotations
 
 import operator
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import torch
+from torch import Tensor
 from torch.nn.functional import pad
 
 import xrgs
@@ -20,9 +21,6 @@ from xrgs.splat.sh import C0, MAX_DEGREE, bases
 from xrgs.splat.torch.projection import depths as camera_depths
 from xrgs.splat.torch.projection import project
 from xrgs.splat.torch_defaults import on_cpu_in_float32
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 RasterizeMode = Literal["classic", "antialiased"]

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import logging
 import re
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from xrgs.errors import XrgsError
 from xrgs.formats.saved import (
@@ -27,17 +29,11 @@ from xrgs.formats.saved import (
 )
 from xrgs.safeio import ply
 from xrgs.safeio.atomic import atomic_writer
+from xrgs.splat.gaussians import Gaussians
 from xrgs.splat.sh import MAX_DEGREE, bases
 from xrgs.splat.torch_defaults import on_cpu_in_float32
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from xrgs.splat.gaussians import Gaussians
-
-    Table = NDArray[np.float32]
+Table = NDArray[np.float32]
 
 _log = logging.getLogger(__name__)
 

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import math
 import shlex
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from torch import Tensor
 
 from xrgs.errors import XrgsError
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-    from torch import Tensor
 
 CERTAIN_LOGIT = 100.0
 """Replaces an infinite logit, up to sign: in float32 the opacity becomes 1, or less than 1e-43."""

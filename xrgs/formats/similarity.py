@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from torch import Tensor
 
 from xrgs.formats.saved import unit_quaternions
 from xrgs.splat.gaussians import Gaussians
 from xrgs.splat.sh import bases, sh_basis
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 #: Relative tolerance for the axes of a similarity to be perpendicular and of equal length.
 _TOLERANCE = 1e-4

@@ -18,10 +18,13 @@ import gzip
 import logging
 import struct
 import zlib
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from xrgs.errors import XrgsError
 from xrgs.formats.saved import (
@@ -33,18 +36,10 @@ from xrgs.formats.saved import (
 )
 from xrgs.formats.similarity import transformed
 from xrgs.safeio.atomic import atomic_writer
-from xrgs.splat.gaussians import PARAMETERS
+from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.splat.sh import MAX_DEGREE, bases
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from xrgs.splat.gaussians import Gaussians
-
-    Bytes = NDArray[np.uint8]
+Bytes = NDArray[np.uint8]
 
 _log = logging.getLogger(__name__)
 

@@ -120,8 +120,7 @@ class Store:
     def prepare(self) -> None:
         """Create the folder and its subfolders, and check that the disk has room.
 
-        Raises:
-            StoreError: The folder can't be written; the message names it and the `store` key.
+        StoreError says that the folder can't be written, and names it and the `store` key.
         """
         try:
             self.path.mkdir(parents=True, exist_ok=True)
@@ -133,11 +132,7 @@ class Store:
         self.check_room()
 
     def check_room(self) -> None:
-        """Check that the disk has room, and leave nothing behind; the folder need not exist yet.
-
-        Raises:
-            StoreError: As `prepare`.
-        """
+        """Check that the disk has room, and leave nothing behind; the folder need not exist yet."""
         folder = self.path.absolute()
         while not folder.exists() and not folder.is_symlink():
             folder = folder.parent
@@ -155,14 +150,7 @@ class Store:
         )
 
     def cell(self, cell_id: str) -> CellFolder:
-        """Return the folder of a cell, which need not exist.
-
-        Args:
-            cell_id: The cell's id.
-
-        Raises:
-            StoreError: The id is not a valid name of a folder.
-        """
+        """Return the folder of a cell, which need not exist; StoreError if its id is no name."""
         if not is_name(cell_id):
             raise StoreError(f"{cell_id!r:.80} is not the id of a cell")
         return CellFolder(self.cells_folder / cell_id)
@@ -295,25 +283,18 @@ class Store:
         """Return the cells, sorted by id, without folders of earlier attempts (`<id>.aside-1`).
 
         A link or a file with the name of a cell is among them; its state says that it is corrupt.
-
-        Raises:
-            StoreError: The folder of cells can't be listed.
         """
         names = list_folder(self.cells_folder)
         return [self.cell(name) for name in names if "." not in name and is_name(name)]
 
     def sweep_ids(self) -> list[str]:
-        """Return the ids of the recorded sweeps, oldest first.
-
-        Raises:
-            StoreError: The folder of the records can't be listed.
-        """
+        """Return the ids of the recorded sweeps, oldest first."""
         names = [name for name in list_folder(self.sweeps) if name.endswith(".json")]
         files = [self.sweeps / name for name in names if is_name(name)]
         return [file.stem for file in sorted(files, key=lambda file: (modified(file) or 0, file))]
 
     def records(self) -> tuple[dict[str, SweepRecord], tuple[str, ...]]:
-        """Read the records of all sweeps, oldest first, by their ids; raises as `sweep_ids`.
+        """Read the records of all sweeps, oldest first, by their ids.
 
         For each one that can't be read there is a message that names its file.
         """
@@ -366,11 +347,7 @@ class Store:
         raise damaged[0]
 
     def sweep_record(self, sweep_id: str | None = None) -> SweepRecord:
-        """Return the record of a sweep; None for the latest.
-
-        Raises:
-            StoreError: There is no such record, or it is damaged or of another version.
-        """
+        """Return the record of a sweep; None for the latest."""
         sweep_id = sweep_id or self.latest_sweep()
         if not is_name(sweep_id):
             raise StoreError(f"{sweep_id!r:.80} is not the id of a sweep")
@@ -378,11 +355,7 @@ class Store:
 
 
 def unchanged_record(file: Path) -> SweepRecord:
-    """Read the record of a sweep, and check by the hash in it that it is the one that was written.
-
-    Raises:
-        StoreError: The record can't be read, or has changed; the message names the file.
-    """
+    """Read the record of a sweep, and check by the hash in it that nobody has changed it."""
     record = read_struct(file, SweepRecord, _MAX_RECORD_BYTES)
     if digest(msgspec.to_builtins(record.cells)) != record.digest:
         raise StoreError(f"{file}: its cells have changed since it was written")

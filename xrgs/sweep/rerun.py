@@ -17,6 +17,7 @@ from typing import Any
 import msgspec
 
 from xrgs import composing
+from xrgs.composing import dotted
 from xrgs.config import Conf
 from xrgs.errors import XrgsError
 from xrgs.runtime.machine import usable_cores
@@ -40,6 +41,8 @@ from xrgs.sweep.plan import PlannedCell
 _RESULTS = ("scores.csv", "history.csv", "splats.ply")
 #: Figures of the summary that are compared; times and memory differ from run to run.
 _COUNTS = ("steps", "gaussians", "evaluations", "grow_grad2d")
+#: Entries of the provenance that are not compared, or are compared otherwise.
+_NOT_COMPARED = {"started", "arithmetic", "machines_in_turn"}
 #: A value that differs is cut to this many characters.
 _MAX_VALUE = 60
 
@@ -162,19 +165,13 @@ def _differences_before(
         if then.code.get(part) != now.code.get(part):
             yield f"code: {part}: {then.code.get(part)} -> {now.code.get(part)}"
     here = provenance.collect(conf.threads or usable_cores(), conf.splat.backend)
-    made, made_now = (msgspec.to_builtins(one) for one in (original.provenance(), here))
-    for name in sorted(made_now.keys() - {"started", "arithmetic", "machines_in_turn"}):
-        yield from _changes(made[name], made_now[name], name)
-
-
-def _changes(then: Any, now: Any, name: str) -> Iterator[str]:
-    """Yield a line for a value that differs; for a dict, one for each entry that does."""
-    if isinstance(now, dict):
-        for key in sorted(then.keys() | now.keys()):
-            yield from _changes(then.get(key), now.get(key), f"{name}.{key}")
-    elif then != now:
-        before, after = (for_line(str(value), _MAX_VALUE) for value in (then, now))
-        yield f"{name}: {before} -> {after}"
+    made, made_now = (
+        dict(dotted(msgspec.to_builtins(one))) for one in (original.provenance(), here)
+    )
+    for name in sorted((made.keys() | made_now.keys()) - _NOT_COMPARED):
+        if made.get(name) != made_now.get(name):
+            values = (for_line(str(of.get(name)), _MAX_VALUE) for of in (made, made_now))
+            yield f"{name}: {' -> '.join(values)}"
 
 
 def _provide(variant_id: str, conf: Conf, store: Store) -> None:

@@ -60,11 +60,11 @@ from xrgs.sweep.job import (
     NOTHING_LOST,
     STOPPED,
     UNWRITABLE,
+    SweepSession,
     unwritable,
 )
 from xrgs.sweep.monitor import SweepMonitor
 from xrgs.sweep.plan import PlannedCell
-from xrgs.sweep.session import SweepSession
 from xrgs.sweep.status import ending
 
 #: An override that sets a key to a number.
