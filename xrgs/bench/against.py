@@ -44,16 +44,11 @@ def measure(
 ) -> dict[str, Any]:
     """Time rendering and training steps in both installations, in turn.
 
-    Args:
-        python: The Python executable of the environment with the other xrgs.
-        scene: The load to render forward and backward.
-        step: The HR and the LR view of the training steps.
-        counts: Numbers of threads; the first is 1.
-        repeats: Number of timed repetitions of each task in each installation.
-
-    Returns:
-        `this` and `other`: folder of the package, and its instruction set; `scene` and `step`:
-        sizes of the loads; `rows`: the result of `summarize`.
+    `python` is the Python executable of the environment with the other xrgs. `scene` is rendered
+    forward and backward, and `step` has the HR and the LR view of the training steps. `counts` are
+    numbers of threads, the first 1. `this` and `other` have the folder of the package and its
+    instruction set, `scene` and `step` the sizes of the loads, and `rows` the result of
+    `summarize`.
     """
     # Not resolved: the Python of a virtual environment is a link, and finds the environment by its
     # own path.

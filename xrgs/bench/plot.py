@@ -1,4 +1,4 @@
-"""Plots the results of the benchmark, with a panel for each question."""
+"""Plots the results of the benchmark, a panel for each question; fits the growth of times."""
 
 from __future__ import annotations
 

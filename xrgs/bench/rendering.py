@@ -1,4 +1,4 @@
-"""Measures rendering forward and backward: time, work, memory, error, and the effect of culling."""
+"""Times tasks in turn, and measures rendering: time, work, memory, error, the effect of culling."""
 
 from __future__ import annotations
 
@@ -35,6 +35,8 @@ STAGES = (
 #: Name of the reference method for all errors.
 TORCH_FLOAT64 = "torch float64"
 INACTIVE_BANDS = "inactive SH bands"
+Row = dict[str, Any]  # column -> value
+_Key = TypeVar("_Key")
 
 
 @dataclass(frozen=True)
@@ -274,10 +276,6 @@ def _compare_shortcuts(
             }
         )
     return rows
-
-
-Row = dict[str, Any]  # column -> value
-_Key = TypeVar("_Key")
 
 
 def time_interleaved(

@@ -174,10 +174,8 @@ def form_of(out: Path) -> str:
 def write_export(path: Path, out: Path | None, layout: str = "auto") -> str:
     """Write an export, and return a line for the terminal.
 
-    Args:
-        path: The folder of a cell or a variant, or a file of Gaussians.
-        out: The file or the folder to write; None names it after `path`.
-        layout: The format; `auto` takes `form_of(out)`.
+    `path` is the folder of a cell or a variant, or a file of Gaussians. `out` is the file or the
+    folder to write; None names it after `path`. The layout `auto` is `form_of(out)`.
 
     Raises:
         XrgsError: The export is not possible in this format, or `out` can't be written.

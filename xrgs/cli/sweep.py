@@ -1,14 +1,15 @@
-"""`xrgs-sweep`: plans a sweep and trains its cells; with `rerun=` it trains one cell again."""
+"""`xrgs-sweep`: trains a sweep, or one cell again (`rerun=`), or explains a key (`help=`)."""
 
 from __future__ import annotations
 
 import os
 import re
 import sys
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import hydra
 from omegaconf import MISSING, DictConfig, OmegaConf
@@ -22,9 +23,6 @@ from xrgs.runtime.signals import exit_on_signal
 from xrgs.runtime.streams import guard_streams, say
 from xrgs.safeio.paths import user_path
 from xrgs.safeio.records import read_file
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
 
 #: With this environment variable Hydra leaves errors to its caller.
 _FULL_ERROR = "HYDRA_FULL_ERROR"
@@ -114,12 +112,10 @@ def main() -> None:
 
 
 def run(command: str, words: Sequence[str], hint: str) -> None:
-    """Run a sweep.
+    """Run a sweep with the arguments of `xrgs-sweep`.
 
-    Args:
-        command: Name of the command, which begins messages.
-        words: The arguments of `xrgs-sweep`.
-        hint: The message if a signal ends the sweep: what is kept, and how to continue.
+    `command` begins messages, and `hint` says, if a signal ends the sweep, what is kept and how to
+    continue.
 
     Raises:
         SystemExit: With code 1 if a cell failed; with a message if the user can correct the

@@ -1,13 +1,15 @@
 """`xrgs-train`: makes a scene of photographs, or of a video, without degrading them.
 
-It inspects the photographs, finds their cameras, chooses a recipe, and trains one cell by the code
-of `xrgs-sweep`. All its choices are overrides of Hydra, which the user's own overrides replace.
+It inspects the photographs, finds their cameras, chooses a recipe (with --minutes also size and
+steps, by this machine's measured speed), and trains one cell by the code of `xrgs-sweep`. All its
+choices are overrides of Hydra, which the user's own overrides replace.
 """
 
 from __future__ import annotations
 
 import shlex
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -17,10 +19,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from xrgs import composing
-from xrgs.cli import budget, options, sweep
+from xrgs.cli import options, sweep
 from xrgs.cli.data import as_they_are, form_of, last_of_each_key, write_export
 from xrgs.cli.options import STORE, Flag, Folder, OptionalFolder, shown_as
 from xrgs.cli.overrides import check_no_axis, explained, with_quotes
+from xrgs.config import Conf
 from xrgs.errors import StoreError, XrgsError
 from xrgs.photos import scenes
 from xrgs.runtime.machine import usable_cores
@@ -29,15 +32,12 @@ from xrgs.runtime.streams import say
 from xrgs.runtime.text import format_duration
 from xrgs.safeio.sanitize import counted, for_line
 from xrgs.splat.settings import NOMINAL_STEPS
+from xrgs.store.cell_folder import CellFolder
+from xrgs.store.inspect import Mixture, SfmReport
 from xrgs.store.store import BASELINE, Store
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from xrgs.bench.speed import Trial
-    from xrgs.config import Conf
-    from xrgs.store.cell_folder import CellFolder
-    from xrgs.store.inspect import Mixture, SfmReport
 
 #: --quality -> its overrides.
 _QUALITIES = {
@@ -137,7 +137,7 @@ def train(settings: Settings) -> None:
         form_of(settings.out)
     words = _words(settings)
     if settings.minutes and settings.size is None:
-        side = budget.size_for(60 * settings.minutes, _measured_unit(words.compose()))
+        side = size_for(60 * settings.minutes, _measured_unit(words.compose()))
         words.own.append(f"variant.long_side={side}")
     with exit_on_signal("Run the same command again to continue."):
         placed = _place(words)
@@ -232,11 +232,9 @@ def _recipe(names: str) -> list[str]:
 
 
 def size_for(seconds: float, unit: float) -> int:
-    """Return the longer side of the views, px, for a time that includes finding the cameras.
+    """Return the longer side of the views, px, for a time, s, that includes finding the cameras.
 
-    Args:
-        seconds: The time of the whole command, s.
-        unit: Seconds per step for each rendered pixel and each Gaussian.
+    `unit` is the seconds per step for each rendered pixel and each Gaussian.
     """
     fitting = [
         size
@@ -248,12 +246,7 @@ def size_for(seconds: float, unit: float) -> int:
 
 
 def steps_for(seconds: float, step_s: float) -> int:
-    """Return how many steps fit into the remaining time, to two digits.
-
-    Args:
-        seconds: The remaining time of the command, s.
-        step_s: Seconds per step.
-    """
+    """Return how many steps of `step_s` seconds fit into the remaining time, to two digits."""
     count = int((_OF_THE_REST * seconds - _ENDING_S) / step_s)
     digits: int = 10 ** max(0, len(str(max(count, 0))) - 2)
     return min(_MOST, max(_LEAST, count // digits * digits))
@@ -276,7 +269,7 @@ def _trial(placed: _Placed, conf: Conf) -> Trial:
 def _choose_steps(words: _Words, settings: Settings, step_s: float, left_s: float) -> None:
     """Choose the steps for the remaining time, and print a command that repeats this training."""
     conf = words.compose()
-    steps = budget.steps_for(left_s, step_s)
+    steps = steps_for(left_s, step_s)
     quality = "high" if steps >= _LONG_RUN else "normal"
     side = conf.variant.long_side
     words.own += [*_QUALITIES[quality], f"variant.long_side={side}", f"train.steps={steps}"]

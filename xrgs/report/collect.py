@@ -1,6 +1,8 @@
-"""Reads the cells of a sweep from the store into tables. Nothing is trained or scored.
+"""Reads the records and the cells of a report's sweeps into tables; nothing is trained or scored.
 
-A cell that is not done becomes a row with its state and the reason, so that a report shows it.
+A study may be trained in parts, for example scene by scene: its report needs the rows of all
+records. A cell that is not done becomes a row with its state and the reason, so that a report shows
+it.
 """
 
 from __future__ import annotations

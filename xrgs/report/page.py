@@ -80,16 +80,9 @@ def build(
 ) -> Report:
     """Write the tables, scores and figures of a sweep, or of several that are joined.
 
-    Args:
-        store_path: The store's folder.
-        sweep_ids: The ids of the sweeps; None takes the latest one.
-        out: The folder to write to; None takes the one that `xrgs-report --help` names.
-        pictures: Names of the pictures to draw, see `xrgs.report.pictures.draw`; None draws all.
-        against: The label that all others are compared with. If no cell is a baseline
-            (`baseline=false`), the first label replaces the baseline.
-        choice: The scenes and ablations of the report.
-        externals: Renders of other programs; each becomes one more label.
-        design: Outcomes, headline labels and margins of the tests; None takes the defaults.
+    The arguments are those of `xrgs-report`, whose help explains them; without `sweep_ids` the
+    latest sweep is taken. `pictures` are names for `xrgs.report.pictures.draw`; None draws all.
+    `design` has outcomes, headline labels and margins of the tests; None takes the defaults.
 
     Raises:
         StoreError: The store has no such sweep.

@@ -156,7 +156,7 @@ def _sensitivities(comparison: Comparison) -> dict[str, _Drawing]:
             drawings[name] = partial(_drawn, title, partial(dependence, title, key, rows, axes))
             if (count := rows["series"].nunique()) >= MAX_ARMS:
                 why = f"{count} curves, and a figure can tell {MAX_ARMS - 1} apart"
-                drawings[name] = lambda _, title=title, why=why: Picture(title, None, why)
+                drawings[name] = partial(_not_drawn, title, why)
     return drawings
 
 
@@ -273,6 +273,10 @@ def _drawn(title: str, figure: Callable[[], bytes], file: Path) -> Picture:
     with atomic_writer(file) as stream:
         stream.write(figure())
     return Picture(title, file)
+
+
+def _not_drawn(title: str, why: str, _: Path) -> Picture:
+    return Picture(title, None, why)
 
 
 def median_view(base: pd.Series, ablation: pd.Series) -> str:

@@ -102,7 +102,9 @@ def totals(cells: pd.DataFrame, done: Mapping[str, DoneCell]) -> pd.DataFrame:
 def totals_table(totals: pd.DataFrame, labels: Sequence[str], condition: str) -> TextTable:
     """Return the table of `totals` of one condition, scene by scene, as means over seeds."""
     chosen = totals[totals["condition"] == condition]
-    numbers = [name for name in totals if name not in CELL_KEYS and chosen[name].notna().any()]
+    numbers = [
+        name for name in totals.columns if name not in CELL_KEYS and chosen[name].notna().any()
+    ]
     names = sorted(numbers, key=lambda name: (name not in _LABELS, is_component_log(name)))
     means = chosen.groupby(["scene", "label"])[names].mean().to_dict("index")
     rows = []

@@ -1,4 +1,4 @@
-"""Cores, threads and memory that this process uses."""
+"""Cores, threads and memory that this process uses, and the processes of this machine."""
 
 from __future__ import annotations
 

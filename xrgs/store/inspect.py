@@ -1,6 +1,7 @@
-"""Says how a variant was made: notes for sweeps and reports, and texts for `xrgs-data inspect`.
+"""Says how a variant was made: notes for sweeps and reports, texts for `xrgs-data inspect`.
 
-Nothing here imports torch.
+A contact sheet shows each view: the whole image, and its centre pixel by pixel. Nothing here
+imports torch.
 """
 
 from __future__ import annotations
@@ -163,9 +164,8 @@ def shared_cameras(manifest: Manifest) -> list[str]:
 def describe(folder: Path, out: Path | None = None) -> str:
     """Describe a frozen variant and draw its contact sheet; for a failed one, say why it failed.
 
-    Args:
-        folder: The variant's folder in a store, or the `failed-...` folder of one that failed.
-        out: The PNG of the contact sheet; None writes `<variant id>.png` to the current folder.
+    The folder is the variant's in a store, or the `failed-...` folder of one that failed. Without
+    `out`, the sheet is `<variant id>.png` in the current folder.
 
     Raises:
         XrgsError: The folder is not a variant, or is damaged, or the sheet can't be written.

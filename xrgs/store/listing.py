@@ -13,17 +13,14 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING
 
 from xrgs.errors import StoreError, XrgsError
 from xrgs.runtime.text import listed
 from xrgs.safeio.files import file_bytes
 from xrgs.splat.backend import arithmetic
+from xrgs.store.cell_folder import CellFolder, CellState
 from xrgs.store.identity import changed_code
 from xrgs.store.schema import Identity, RecordedCell, SweepRecord
-
-if TYPE_CHECKING:
-    from xrgs.store.cell_folder import CellFolder, CellState
 
 #: The states that a cell of a store can have.
 STATES = ("done", "running", "planned", "unfinished", "failed", "corrupt")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -15,10 +15,8 @@ from xrgs.composing import dotted
 from xrgs.errors import StoreError, XrgsError
 from xrgs.evaluation.metrics import METRICS
 from xrgs.safeio.sanitize import for_line
+from xrgs.store.cell_folder import CellFolder
 from xrgs.store.schema import RecordedCell, Summary
-
-if TYPE_CHECKING:
-    from xrgs.store.cell_folder import CellFolder
 
 #: The names of a cell in a sweep's record.
 CELL_NAMES = ("scene", "label", "condition")

@@ -98,17 +98,11 @@ def verify_variant(folder: Path) -> list[str]:
 
 
 def texture(image: NDArray[np.float32], mask: NDArray[np.bool_] | None = None) -> float:
-    """Return the mean magnitude of an image's gradient, in intensity per px.
+    """Return the mean magnitude of an image's gradient, in intensity per px; NaN for no pixel.
 
     It is `xrgs.training.components.texture.mean_gradient`, always without the last row and column,
-    which repeat others there. That function needs torch; this one does not.
-
-    Args:
-        image: [H, W, 3] in 0..1.
-        mask: [H, W], True for a pixel that is used; None uses all.
-
-    Returns:
-        The mean over the pixels, at most sqrt(2); NaN where there is none.
+    which repeat others there. That function needs torch; this one does not. The image is [H, W, 3]
+    in 0..1, and a mask [H, W] is True for a pixel that is used.
     """
     if min(image.shape[:2]) < 2:
         return math.nan

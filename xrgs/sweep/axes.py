@@ -1,4 +1,9 @@
-"""Expands the axes of a command line into cells, each group with its matching baseline."""
+"""Parses the axes of a command line and expands them into cells, each group with its baseline.
+
+Hydra's grammar has functions for axes, such as `range(0.1, 0.4, 0.1)` and `sort(...)`. The ranges
+of hydra-core 1.3 have faults: decimal ones add up rounding errors and include the stop that they
+should exclude, and sorting changes the values. Ranges here are those of Hydra 1.4.
+"""
 
 from __future__ import annotations
 

@@ -21,6 +21,7 @@ import sys
 import tempfile
 import time
 import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -31,6 +32,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from xrgs.config import Conf, LimitsConf
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.mixture.paths import trimmed_folder
 from xrgs.runtime import lease, machine
@@ -46,15 +48,11 @@ from xrgs.splat.backend import arithmetic
 from xrgs.store.attempts import begin_attempt
 from xrgs.store.cell_folder import LOG, CellFolder
 from xrgs.store.identity import changed_code
+from xrgs.store.schema import Identity
 from xrgs.store.store import Store
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
-
     from omegaconf import DictConfig
-
-    from xrgs.config import Conf, LimitsConf
-    from xrgs.store.schema import Identity
 
 #: Outcomes of a job other than the states of a cell. LOCKED: another process trains the cell.
 #: STOPPED: the sweep is over, or no further job may begin. UNWRITABLE: the store can't be written.

@@ -15,7 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import fmean
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 from tqdm import tqdm
 
@@ -26,9 +26,7 @@ from xrgs.runtime.text import format_duration
 from xrgs.safeio.files import list_names
 from xrgs.safeio.sanitize import for_line
 from xrgs.store.cell_folder import CellFolder
-
-if TYPE_CHECKING:
-    from xrgs.sweep.plan import PlannedCell
+from xrgs.sweep.plan import PlannedCell
 
 #: Least seconds between two snapshots.
 _POLL_S = 1.0

@@ -1,10 +1,13 @@
-"""The planned cells of a study: their settings, states and costs, and the cells left to train."""
+"""The planned cells of a study: their settings, states and costs, and the cells left to train.
+
+A count-matched cell is a control for a claim of efficiency: it has as many Gaussians as another
+cell, its reference (`xrgs.training.count_matching`).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 from xrgs.config import Conf
 from xrgs.errors import XrgsError
@@ -22,10 +25,8 @@ from xrgs.store.identity import cell_id, cell_identity
 from xrgs.store.schema import Identity, RecordedCell
 from xrgs.store.store import BASELINE, Store
 from xrgs.sweep import build_variants
+from xrgs.sweep.axes import CellSpec
 from xrgs.sweep.estimate import TORCH_SLOWDOWN, Cost, CostEstimator
-
-if TYPE_CHECKING:
-    from xrgs.sweep.axes import CellSpec
 
 #: The condition of cells that hold no view out.
 _ON_TRAINING_VIEWS = "scored on the training views"

@@ -78,15 +78,9 @@ def rerun(
 ) -> RerunResult:
     """Train a finished cell again and compare the results.
 
-    Args:
-        folder: The cell's folder, in a store or elsewhere.
-        out: Folder to write to; by default `<folder>.rerun-1`, or the next free number.
-        store: The store that has the cell's variant, or in which it is built; by default the one
-            that the folder is in.
-        threads: By default as many as the cell was trained with. No result should depend on it.
-        photographs: Replaces the config's `scene.path`, if the variant has to be built.
-        plugins: Names of the components of other packages that may be imported. A cell that needs
-            another one is refused: a store must not decide which code is imported.
+    The arguments are those of `xrgs-sweep rerun=` (`xrgs.cli.sweep.RerunConf`). A cell that needs a
+    component of another package that is not among `plugins` is refused: a store must not decide
+    which code is imported.
 
     Raises:
         XrgsError: The folder has no finished cell, or a config with unknown keys; the variant is
@@ -170,8 +164,8 @@ def _differences_before(
     )
     for name in sorted((made.keys() | made_now.keys()) - _NOT_COMPARED):
         if made.get(name) != made_now.get(name):
-            values = (for_line(str(of.get(name)), _MAX_VALUE) for of in (made, made_now))
-            yield f"{name}: {' -> '.join(values)}"
+            before, after = (for_line(str(of.get(name)), _MAX_VALUE) for of in (made, made_now))
+            yield f"{name}: {before} -> {after}"
 
 
 def _provide(variant_id: str, conf: Conf, store: Store) -> None:

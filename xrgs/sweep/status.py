@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -54,15 +55,15 @@ _NAMES = frozenset({"cell_id", "scene", "label", "condition", "variant"})
 class _Problems(list[str]):
     """Lines that name files and folders that can't be read, or that don't belong in a store."""
 
-    def note_error(self, look: Callable[[], _T], default: _T) -> _T:
-        """Return the result of a function; if it can't read a file, add a line."""
+    def note_error(self, look: Callable[[], _T]) -> _T | None:
+        """Return the result of a function; if it can't read a file, add a line and return None."""
         try:
             return look()
         except StoreError as error:
             self.append(str(error))
         except OSError as error:
             self.append(f"{error.filename}: {error.strerror}")
-        return default
+        return None
 
 
 def describe(path: Path) -> str:
@@ -76,28 +77,30 @@ def describe(path: Path) -> str:
     """
     store, problems = Store(path), _Problems()
     store.check_exists()
-    records, damaged = problems.note_error(store.records, ({}, ()))
+    records, damaged = problems.note_error(store.records) or ({}, ())
     problems += damaged
-    cells = problems.note_error(lambda: store.cell_rows(records), [])
+    cells = problems.note_error(partial(store.cell_rows, records)) or []
     counts = Counter(cell.state.name for cell in cells)
     parts = [f"{counts[state]} {state}" for state in STATES if counts[state]]
     lines = [f"store {path}: {counted(len(cells), 'cell')}", f"  {', '.join(parts) or 'none'}"]
-    names = problems.note_error(lambda: list_folder(store.cells_folder), [])
+    names = problems.note_error(partial(list_folder, store.cells_folder)) or []
     wrong = [name for name in names if not is_name(name)]
     problems += [f"{store.cells_folder}/{name}: a cell can't have this name" for name in wrong]
     if aside := sum("." in name and is_name(name) for name in names):
         lines.append(f"  {counted(aside, 'folder')} of earlier attempts and reruns (*.*)")
-    names = problems.note_error(lambda: list_folder(store.variants), [])
+    names = problems.note_error(partial(list_folder, store.variants)) or []
     variants = {name: (store.variants / name).is_dir() for name in names if is_variant(name)}
     problems += [
         f"{store.variants}/{name}: not a folder" for name, of in variants.items() if not of
     ]
     sweeps = counted(len(records) + len(damaged), "sweep")
     lines.append(f"  {counted(sum(variants.values()), 'variant')}, {sweeps} recorded")
-    scenes = problems.note_error(lambda: failed_scenes(store.variants), {}) if names else {}
-    folders = [name for name in problems.note_error(lambda: list_folder(path), [])
-               if (path / name).is_dir()]  # fmt: skip
-    sizes = {n: problems.note_error(lambda n=n: file_bytes(path / n), None) for n in folders}
+    scenes = problems.note_error(partial(failed_scenes, store.variants)) if names else None
+    sizes = {
+        name: problems.note_error(partial(file_bytes, path / name))
+        for name in problems.note_error(partial(list_folder, path)) or []
+        if (path / name).is_dir()
+    }
     at_least = " at least" * (None in sizes.values())
     texts = [f"{name} {format_size(size)}" for name, size in sorted(sizes.items())]
     total = format_size(sum(size or 0 for size in sizes.values()))
@@ -107,7 +110,7 @@ def describe(path: Path) -> str:
     for state in ("running", "failed", "corrupt", "unfinished"):
         of_state = [cell for cell in cells if cell.state.name == state]
         lines += _named(f"{state}:", [_reason(cell) for cell in of_state])
-    failed = ["  ".join((key, *why)) for key, why in scenes.items()]
+    failed = ["  ".join((key, *why)) for key, why in (scenes or {}).items()]
     lines += _named("failed scenes, not tried again; retry=failed tries them again", failed)
     lines += TO_TRY if failed else ()
     changed = Counter(part for cell in cells for part in cell.stale)

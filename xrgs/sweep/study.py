@@ -320,12 +320,9 @@ class Launches:
     def launch(self, cells: Iterable[PlannedCell], store: Store) -> dict[str, str]:
         """Launch cells that have an identity, the longest first, and wait for them.
 
-        Returns:
-            The outcome of each cell's job by the cell's id: what `run_job` returned, `LOST` if the
-            cell may be launched again, or the cell's state after its last loss.
-
-        Raises:
-            XrgsError: The launcher can't be used, or begins no job; or the store is gone.
+        The outcome of each cell's job, by the cell's id, is what `run_job` returned, `LOST` if the
+        cell may be launched again, or the cell's state after its last loss. XrgsError says that the
+        launcher can't be used, or begins no job, or that the store is gone.
         """
         self._session = session = self._session or self._begin(store)
         cells = sorted(cells, key=plans.expected_length, reverse=True)

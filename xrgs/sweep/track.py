@@ -297,8 +297,8 @@ def curves(cell: CellFolder, *, done: bool) -> Curves:
         StoreError: A file can't be read; the message names it.
         ValueError: A value is not a number.
     """
-    rows = _table(cell.path / "history.csv", "history")
-    last = rows[-1][0]
+    history = _table(cell.path / "history.csv", "history")
+    rows = [*history]
     if (quality := cell.path / "quality.csv").is_file():
         rows += _table(quality, "quality")
     if done:
@@ -308,7 +308,7 @@ def curves(cell: CellFolder, *, done: bool) -> Curves:
         scores = cell_metrics(summary, cell.scores())
         rows.append((summary.steps, {f"score/{name}": score for name, score in scores.items()}))
     else:
-        rows = [(step, values) for step, values in rows if step <= last]
+        rows = [(step, values) for step, values in rows if step <= history[-1][0]]
     by_step: Curves = {}
     for step, values in sorted(rows, key=lambda row: row[0]):
         numbers = {name: value for name, value in values.items() if not math.isnan(value)}

@@ -48,20 +48,10 @@ def make_film(
     size: tuple[int, int] | None = None,
     fps: int = 30,
 ) -> str:
-    """Render models of one world side by side along a path through the scene.
+    """Render models of one world side by side along a path, into an .mp4 file or a folder of PNGs.
 
-    Args:
-        models: The models; the path is fitted to the cameras of the first that has any.
-        out: An .mp4 file, which is replaced, or a new or empty folder for PNGs, one for each frame.
-        path: A name in `xrgs.viewer.paths.PATHS`; None for `orbit`, or for `training` if an orbit
-            would leave the space that the training cameras see.
-        views: Number of frames. All have the intrinsics of the first test view.
-        size: Width and height of one model's panel, px, both even; None for the size of the first
-            test view, cut to even numbers.
-        fps: Frames per second of a film.
-
-    Returns:
-        A line for the terminal: the file, the number and size of the frames, the path.
+    The arguments are those of `xrgs-render`, whose help explains them. The path is fitted to the
+    cameras of the first model that has any. A line for the terminal is returned.
 
     Raises:
         XrgsError: An argument is out of its range, no model has cameras, PyAV is missing, or `out`

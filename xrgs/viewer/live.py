@@ -2,7 +2,8 @@
 
 Each model has its own viser server, since a page of viser shows one scene. If the user moves the
 camera of a frame, those of the other frames follow. All servers listen only on the loopback
-interface.
+interface. A browser sorts and blends all Gaussians itself, which is slow for more than some hundred
+thousand, so that the least opaque ones can be left out.
 """
 
 from __future__ import annotations

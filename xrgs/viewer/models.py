@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,11 +15,9 @@ from xrgs.safeio.sanitize import for_line
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import Gaussians
 from xrgs.splat.settings import RasterSettings
+from xrgs.store.cell_folder import CellFolder
+from xrgs.store.store import Store
 from xrgs.viewer.paths import Poses
-
-if TYPE_CHECKING:
-    from xrgs.store.cell_folder import CellFolder
-    from xrgs.store.store import Store
 
 _log = logging.getLogger(__name__)
 

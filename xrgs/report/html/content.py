@@ -181,7 +181,7 @@ def answers(comparison: Comparison) -> list[dict[str, Any]]:
     `worse` with their changes, and in `undecided` the metrics of each other verdict.
     """
     means = by_key(comparison.means)
-    result = []
+    result: list[dict[str, Any]] = []
     for label, condition in comparison.groups:
         rows = [
             (metric, means[label, condition, metric.name])

@@ -58,12 +58,10 @@ _MAX_KEPT, _MIN_KEPT = 100_000, 8_000
 
 
 class Album:
-    """Adds images to those of a page, each image once.
+    """Adds images to those of a page (`urls`, as data URLs), each image once.
 
-    Args:
-        urls: The images of the page, as data URLs; new ones are appended.
-        max_bytes: The most bytes of all added data URLs.
-        pixels: The expected number of added pixels, which decides the quality.
+    All added data URLs have at most `max_bytes`. The expected number of added `pixels` decides the
+    quality.
     """
 
     def __init__(self, urls: list[str], max_bytes: int, pixels: int) -> None:
