@@ -28,7 +28,7 @@ from latex2mathml.converter import convert
 from mkdocs.structure.files import File
 
 from xrgs import config as xrgs_config
-from xrgs.cli import key_help
+from xrgs.cli import sweep
 from xrgs.registry import BUILT_IN
 
 if TYPE_CHECKING:
@@ -144,7 +144,7 @@ def keys_page() -> str:
         " and shrink with `train.steps`, unless a key says otherwise.",
     ]
     titles: dict[str, list[str]] = {"": ["## The run"]}  # a group's title and keys, by its name
-    for key, (value, comment) in key_help.entries().items():
+    for key, (value, comment) in sweep.entries().items():
         text = html.escape(" ".join(comment), quote=False)
         text = text[:1].upper() + text[1:]  # of a comment behind a value
         if not value:

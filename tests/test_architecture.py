@@ -57,9 +57,9 @@ ONLY_IN = {
     "tifffile": ("photos/tiff",),
     "viser": ("viewer/live",),
     "zstandard": ("formats/spz",),
-    "tensorboard": ("sweep/trackers",),
-    "mlflow": ("sweep/trackers",),
-    "wandb": ("sweep/trackers",),
+    "tensorboard": ("sweep/track",),
+    "mlflow": ("sweep/track",),
+    "wandb": ("sweep/track",),
 }
 #: Modules that must load without torch, pycolmap, kornia and scikit-image: planning, reporting.
 LIGHT = (
@@ -75,11 +75,9 @@ LIGHT = (
     "report",
     "sweep.build_variants",
     "sweep.cleaning",
-    "sweep.inventory",
     "sweep.job",
     "sweep.monitor",
     "sweep.rerun",
-    "sweep.session",
     "sweep.status",
     "sweep.study",
 )

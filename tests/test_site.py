@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 import xrgs
-from xrgs.cli.key_help import entries
+from xrgs.cli.sweep import entries
 from xrgs.registry import BUILT_IN
 
 pytestmark = pytest.mark.slow

@@ -8,11 +8,14 @@ from __future__ import annotations
 
 import re
 import threading
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import is_dataclass
 from functools import cache, reduce
 from operator import getitem
+from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
@@ -24,10 +27,6 @@ from xrgs.safeio.records import read_struct
 from xrgs.splat.settings import NOMINAL_STEPS, outside_limits
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-    from types import ModuleType
-
     from omegaconf import DictConfig
 
 
@@ -104,9 +103,16 @@ def to_conf(cfg: DictConfig) -> Conf:
         return OmegaConf.to_container(value, resolve=True, throw_on_missing=True)
 
     values = {name: plain(name) for name in map(str, cfg) if name != "hydra"}
-    _check_integers(values)
+    for key, value in dotted(values):
+        if isinstance(value, int) and not -(2**63) <= value < 2**63:  # torch can't hold it
+            raise XrgsError(f"{key}={value}: must be below 2^63 = {2**63}")
     conf = from_dict(values)
-    _expand_home(conf)
+    for key in PATHS:
+        *groups, name = key.split(".")
+        group = reduce(getattr, groups, conf)
+        path = getattr(group, name)
+        if path is not None and path.startswith("~"):
+            setattr(group, name, str(user_path(path)))
     _check_limits(conf)
     if (seed := conf.variant.sfm.seed) >= 2**31:
         raise XrgsError(
@@ -116,23 +122,17 @@ def to_conf(cfg: DictConfig) -> Conf:
     return conf
 
 
-def _expand_home(conf: Conf) -> None:
-    """Replace `~` by the user's home folder in every path."""
-    for key in PATHS:
-        *groups, name = key.split(".")
-        group = reduce(getattr, groups, conf)
-        path = getattr(group, name)
-        if path is not None and path.startswith("~"):
-            setattr(group, name, str(user_path(path)))
-
-
-def _check_integers(values: dict[str, Any], path: str = "") -> None:
-    """Raise `XrgsError` for an integer that torch can't hold; the message names its key."""
+def dotted(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the values of nested dicts with their dotted keys, as `splat.densify.every`."""
     for name, value in values.items():
         if isinstance(value, dict):
-            _check_integers(value, f"{path}{name}.")
-        elif isinstance(value, int) and not -(2**63) <= value < 2**63:
-            raise XrgsError(f"{path}{name}={value}: must be below 2^63 = {2**63}")
+            yield from dotted(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
+
+
+def _value(conf: Conf, key: str) -> Any:
+    return reduce(getattr, key.split("."), conf)
 
 
 def _check_limits(group: Any, path: str = "") -> None:
@@ -153,21 +153,18 @@ def _check_strategy(conf: Conf) -> None:
                 f"splat.densify.noise={densify.noise}: must be 0 with splat.strategy=default, which"
                 " adds no noise"
             )
-        return
-    if densify.budget == 0:
+    elif densify.budget == 0:
         raise XrgsError(
             "splat.densify.budget=0: must be above 0 with splat.strategy=mcmc, which adds Gaussians"
             " up to it; +ablation=mcmc has a budget"
         )
-    for key, value, accepted in (
-        ("splat.densify.split", densify.split, "random"),
-        ("splat.raster.absgrad", conf.splat.raster.absgrad, False),
-    ):
-        if value != accepted:
-            raise XrgsError(
-                f"{key}={value}: must be {accepted} with splat.strategy=mcmc, which splits nothing"
-                " and reads no image-plane gradient"
-            )
+    else:
+        for key, accepted in (("splat.densify.split", "random"), ("splat.raster.absgrad", False)):
+            if (value := _value(conf, key)) != accepted:
+                raise XrgsError(
+                    f"{key}={value}: must be {accepted} with splat.strategy=mcmc, which splits"
+                    " nothing and reads no image-plane gradient"
+                )
 
 
 #: Former group of `components`, now a plugin of the same name -> the key that switched it on, and

@@ -7,10 +7,11 @@ module. `xrgs.composing` makes configs.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, is_dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import Field, dataclass, field, fields, is_dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_type_hints
+from typing import Any, get_type_hints
 
 from xrgs.splat.backend import CHOICES
 from xrgs.splat.settings import (
@@ -21,10 +22,6 @@ from xrgs.splat.settings import (
     OptimizerSettings,
     RasterSettings,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-    from dataclasses import Field
 
 _PACKAGE = Path(__file__).parent
 #: Folder of the config's files: inside the package in a wheel, next to it in a checkout.

@@ -13,21 +13,16 @@ This module does not import torch, so that planning and reporting stay quick.
 from __future__ import annotations
 
 import dataclasses
-from importlib.machinery import PathFinder
+from collections.abc import Iterator, Mapping
+from importlib.machinery import ModuleSpec, PathFinder
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, get_type_hints
+from typing import Any, TypeVar, get_type_hints
 
 from xrgs.errors import XrgsError
-from xrgs.safeio.code import digest_files
+from xrgs.safeio.code import CodeFolders, digest_files
 from xrgs.safeio.hashing import digest
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-    from importlib.machinery import ModuleSpec
-
-    from xrgs.safeio.code import CodeFolders
 
 GROUP = "xrgs.components"
 """The entry point group of components."""

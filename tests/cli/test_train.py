@@ -14,7 +14,7 @@ import pytest
 from tests.conftest import composed_by_hydra
 from xrgs import composing
 from xrgs.bench.speed import Trial
-from xrgs.cli import budget, sweep, train
+from xrgs.cli import sweep, train
 from xrgs.photos.scenes import motorcycle
 from xrgs.store.cell_folder import CellFolder
 from xrgs.store.inspect import ALIKE_RECIPE, MIXTURE_RECIPE, Mixture, SfmReport
@@ -35,7 +35,7 @@ def handed_over(
         monkeypatch.setattr(train, "_place", lambda _: found)
         monkeypatch.setattr(composing, "compose", composed_by_hydra)
         monkeypatch.setattr(train, "_measured_unit", lambda _: 1e-7)
-        monkeypatch.setattr(train, "_units_of_a_step", lambda *_: 1e5)
+        monkeypatch.setattr("xrgs.sweep.estimate.units_of_a_step", lambda *_: 1e5)
         monkeypatch.setattr(train, "_trial", lambda *_: Trial(start_s=0.0, step_s=0.01))
         monkeypatch.setattr(train, "_say_end", lambda *_: None)
         monkeypatch.setattr(train, "_cell", lambda *_: CellFolder(Path("absent")))
@@ -132,13 +132,13 @@ def test_the_user_may_replace_what_minutes_choose(
 
 def test_more_time_gives_larger_views_and_more_steps_and_never_exceeds_the_time() -> None:
     for unit in (1e-8, 1e-7, 1e-6):
-        sizes = [budget.size_for(60.0 * minutes, unit) for minutes in (1, 5, 20, 60, 600)]
+        sizes = [train.size_for(60.0 * minutes, unit) for minutes in (1, 5, 20, 60, 600)]
         assert sizes == sorted(sizes)
-    steps = [budget.steps_for(seconds, 0.05) for seconds in (60, 300, 1200)]
+    steps = [train.steps_for(seconds, 0.05) for seconds in (60, 300, 1200)]
     assert steps == sorted(steps)
     for seconds, count in zip((60, 300, 1200), steps, strict=True):
         assert 0.7 * seconds - 15 < 0.05 * count < seconds
-    assert budget.steps_for(1, 0.05) == 200  # too little time for anything: the fewest
+    assert train.steps_for(1, 0.05) == 200  # too little time for anything: the fewest
 
 
 @pytest.mark.parametrize(

@@ -21,9 +21,9 @@ from xrgs.config import VariantConf
 from xrgs.mixture import mixing, sfm
 from xrgs.mixture.degradations import DEGRADATIONS
 from xrgs.mixture.photographs import prepare_hr_views, write_degraded
-from xrgs.mixture.sfm import Reconstruction, SfmImage
+from xrgs.mixture.sfm import SfmImage
 from xrgs.mixture.tags import POLICIES
-from xrgs.mixture.views import SceneFailed, Variant, View
+from xrgs.mixture.views import Reconstruction, SceneFailed, Variant, View
 from xrgs.photos import images, scenes
 from xrgs.photos.scenes import Scene, procedural
 

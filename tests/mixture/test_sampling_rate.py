@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from xrgs.errors import XrgsError
 from xrgs.mixture import sampling_rate
 from xrgs.mixture.sampling_rate import Measures
-from xrgs.mixture.sfm import Reconstruction
 from xrgs.mixture.tags import POLICIES
+from xrgs.mixture.views import Reconstruction
 from xrgs.photos.lens import lens_of_model
 
 

@@ -15,11 +15,12 @@ import pytest
 from xrgs.config import Conf, SceneConf, SfmConf
 from xrgs.mixture import sfm
 from xrgs.mixture.pose_error import pose_error
+from xrgs.mixture.views import Reconstruction
 from xrgs.photos import images, scenes
 from xrgs.photos.scenes import motorcycle
 from xrgs.photos.scenes.scene import bundled_photograph
 
-StereoPair = tuple[Path, sfm.Reconstruction]
+StereoPair = tuple[Path, Reconstruction]
 
 
 def test_features_fall_with_the_number_of_images_and_small_ones_are_doubled() -> None:

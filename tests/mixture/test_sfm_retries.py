@@ -18,7 +18,7 @@ from skimage import data
 from xrgs.config import SceneConf, SfmConf, VariantConf
 from xrgs.mixture import poses, sfm, sfm_retries
 from xrgs.mixture.photographs import PhotoCollection, prepare_hr_views, write_degraded
-from xrgs.mixture.sfm import Reconstruction
+from xrgs.mixture.views import Reconstruction
 from xrgs.photos import images, scenes
 from xrgs.photos.lens import Lens
 from xrgs.photos.scenes import Scene

@@ -18,9 +18,8 @@ from xrgs.errors import XrgsError
 from xrgs.mixture import saved_variant
 from xrgs.mixture.views import Variant, View
 from xrgs.report import build
-from xrgs.report.collect import ReportError
+from xrgs.report.collect import ReportError, ReportStore
 from xrgs.report.external import External, parse, with_external
-from xrgs.report.joined import ReportStore
 
 SIZE = (32, 24)
 VIEWS = ("IMG_001", "IMG_009")

@@ -11,9 +11,9 @@ from PIL import Image
 from scipy.stats import spearmanr
 
 from xrgs.evaluation.metrics import METRICS
+from xrgs.report.collect import ReportStore
 from xrgs.report.compare import compare
 from xrgs.report.context import Context
-from xrgs.report.joined import ReportStore
 from xrgs.report.page import build
 from xrgs.report.paper import paper_tables, texture_tables, why_no_table, with_texture
 from xrgs.runtime.text import TextTable

@@ -246,7 +246,7 @@ DOORS = {
     "logging.basicConfig": {"runtime/streams"},
     "logging.StreamHandler": {"runtime/streams"},
     "warnings.warn": {"__init__"},  # sentences of our own
-    "csv.writer": {"sweep/trackers"},  # each text goes through `for_csv`
+    "csv.writer": {"sweep/track"},  # each text goes through `for_csv`
     "csv.DictWriter": {"safeio/records"},
     "*.to_csv": {"report/html/document", "report/page"},
     "*.to_html": set(),

@@ -15,7 +15,7 @@ import msgspec
 import pytest
 
 from tests.store.cells import begun
-from xrgs.config import Conf
+from xrgs.config import TRAINING_VIEWS, Conf
 from xrgs.evaluation import protocol
 from xrgs.evaluation.metrics import VIEW_METRICS
 from xrgs.mixture.views import Variant
@@ -41,7 +41,7 @@ def test_the_controls_choose_the_views_that_are_trained_on_and_scored(
         raise RuntimeError(f"{use} {validation} {seed}")
 
     monkeypatch.setattr(dataset, "load", load)
-    for ablation in ("baseline", *dataset.USES[1:]):
+    for ablation in ("baseline", *TRAINING_VIEWS[1:]):
         views = "mixed" if ablation == "baseline" else ablation
         conf = compose(f"+ablation={ablation}", "train.validation=0.1", "seed=7")
         with pytest.raises(RuntimeError, match=rf"^{views} 0\.1 7$"):

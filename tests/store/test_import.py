@@ -20,7 +20,7 @@ from xrgs.safeio.atomic import write_json
 from xrgs.safeio.files import list_names
 from xrgs.safeio.hashing import digest, file_digest
 from xrgs.store import archive
-from xrgs.store.archive import Imported, import_store, pack
+from xrgs.store.archive import Copied, import_store, pack
 from xrgs.store.cell_folder import CellFolder
 from xrgs.store.identity import cell_id
 from xrgs.store.store import Store
@@ -91,12 +91,10 @@ def test_a_store_is_imported_whole(foreign: Store, mine: Store, kind: str) -> No
         mode = {".tar": "w"}.get(kind, f"w:{kind[5:]}")
         source = packed_as(foreign, foreign.path.parent / f"a{kind}", mode)
     found = import_store(source, mine)
-    assert found == Imported(1, 1, 1, 1, 0, ())
-    assert str(found) == (
-        "imported: 1 cell, 1 variant, 1 rendered scene, 1 record of sweeps; already there: 0"
-    )
+    assert found == Copied(1, 1, 1, 1, ())
+    assert str(found) == "1 cell, 1 variant, 1 rendered scene, 1 record of sweeps"
     assert contents(mine) == expected
-    assert import_store(source, mine) == Imported(0, 0, 0, 0, 4, ())
+    assert import_store(source, mine) == Copied(0, 0, 0, 0, (), present=4)
     assert contents(mine) == expected
 
 
@@ -104,12 +102,12 @@ def test_what_was_packed_is_imported_and_there_is_no_second_one(
     foreign: Store, mine: Store, tmp_path: Path
 ) -> None:
     pack(foreign, foreign.cell_folders(), tmp_path / "a.tar.xz", tmp_path)
-    assert import_store(tmp_path / "a.tar.xz", mine) == Imported(1, 1, 0, 1, 0, ())
+    assert import_store(tmp_path / "a.tar.xz", mine) == Copied(1, 1, 0, 1, ())
     (variant,) = list_names(mine.variants)
     assert variant.startswith("trimmed-")
     assert mine.sweep_record().cells == foreign.sweep_record().cells
     # The variant with its images is the same one, and what is mine is left as it is.
-    assert import_store(foreign.path, mine) == Imported(0, 0, 1, 0, 3, ())
+    assert import_store(foreign.path, mine) == Copied(0, 0, 1, 0, (), present=3)
     assert list_names(mine.variants) == [variant]
 
 
@@ -398,5 +396,5 @@ def test_a_cell_that_a_sweep_begins_meanwhile_is_the_sweeps(
 
     real = archive._Import._copy
     monkeypatch.setattr(archive._Import, "_copy", begun)
-    assert import_store(foreign.path, mine) == Imported(0, 1, 1, 1, 1, ())
+    assert import_store(foreign.path, mine) == Copied(0, 1, 1, 1, (), present=1)
     assert list_names(cell.path) == ["log.txt"]

@@ -25,8 +25,14 @@ from xrgs.photos import images
 from xrgs.runtime.text import to_text
 from xrgs.safeio.sanitize import MAX_LINE
 from xrgs.store import inspect
-from xrgs.store.contact_sheet import COLOURS, contact_sheet
-from xrgs.store.inspect import SfmReport, describe, shared_cameras, views_table
+from xrgs.store.inspect import (
+    COLOURS,
+    SfmReport,
+    contact_sheet,
+    describe,
+    shared_cameras,
+    views_table,
+)
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -285,7 +291,7 @@ def test_one_image_that_cant_be_read_does_not_take_the_sheet(
     assert len(np.unique(high[4:196, 4:456])) > 1  # it says so
     assert held_out[4:196, 4:260].std() > 20  # the others are drawn as ever
     assert low[4:196, 4:260].std() > 20
-    monkeypatch.setattr("xrgs.store.contact_sheet._MAX_TILES", 2)
+    monkeypatch.setattr("xrgs.store.inspect._MAX_TILES", 2)
     assert contact_sheet(mixed)[1][0] == "the first 2 of 3 views"
 
 

@@ -12,7 +12,7 @@ from tests.store.cells import finished, identity, row, write_variant
 from xrgs.errors import StoreError
 from xrgs.mixture import saved_variant
 from xrgs.safeio.files import list_names
-from xrgs.store.archive import Packed, pack
+from xrgs.store.archive import Copied, pack
 from xrgs.store.cell_folder import CellFolder
 from xrgs.store.store import Store, unchanged_record
 
@@ -35,7 +35,7 @@ def store(tmp_path: Path) -> Store:
     return store
 
 
-def pack_all(store: Store, out: Path) -> Packed:
+def pack_all(store: Store, out: Path) -> Copied:
     return pack(store, store.cell_folders(), out, out.parent)
 
 

@@ -21,7 +21,7 @@ from xrgs.mixture.views import Variant
 from xrgs.photos import images
 from xrgs.photos.scenes import procedural
 from xrgs.safeio.hashing import file_digest
-from xrgs.store import restore
+from xrgs.store import trimming
 
 pytestmark = pytest.mark.slow
 
@@ -48,7 +48,7 @@ def made_again(tmp_path: Path, stereo_scene: SceneConf, small_conf: Conf) -> Res
     def run(folder: Path, scene: SceneConf = stereo_scene, conf: VariantConf | None = None) -> None:
         work = tmp_path / "work"
         work.mkdir(exist_ok=True)
-        restore.restore_images(folder, scene, conf or small_conf(scene), work, tmp_path)
+        trimming.restore_images(folder, scene, conf or small_conf(scene), work, tmp_path)
 
     return run
 

@@ -26,7 +26,7 @@ from xrgs.store.cell_folder import CellFolder
 from xrgs.store.identity import cell_id, cell_identity
 from xrgs.store.schema import RecordedCell
 from xrgs.store.store import Store
-from xrgs.sweep.session import SweepSession
+from xrgs.sweep.job import SweepSession
 from xrgs.sweep.study import Study
 
 #: The id of a variant that is not built.

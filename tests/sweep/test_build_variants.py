@@ -28,7 +28,7 @@ from xrgs.store import inspect
 from xrgs.store.store import Store, StoreGoneError
 from xrgs.sweep import build_variants, job
 from xrgs.sweep.build_variants import PlannedVariant
-from xrgs.sweep.status import describe, read
+from xrgs.sweep.status import describe
 
 BUILDING = "building the mixed-resolution variant"
 CONF = ("variant.factor=1", "variant.sfm.fallbacks=false")
@@ -278,7 +278,7 @@ def test_sweeps_of_a_scene_that_sfm_can_not_place(
     assert "0 of 3 photographs are placed" in err
     assert HINT in err
     assert err.count(TO_TRY[0]) == table.count(TO_TRY[0]) == 1
-    text = describe(read(tmp_path / "s"))
+    text = describe(tmp_path / "s")
     assert "failed scenes, not tried again; retry=failed tries them again" in text
     assert "  leaves  scene leaves failed: 0 of 3 photographs are placed" in text
     assert "\n".join(TO_TRY) in text

@@ -10,11 +10,11 @@ from typing import Any
 
 import pytest
 
+from xrgs.cli.store import Filter
 from xrgs.errors import XrgsError
 from xrgs.runtime import lease
-from xrgs.store.listing import Selection
 from xrgs.store.store import Store
-from xrgs.sweep.inventory import list_cells, list_sweeps, show
+from xrgs.sweep.status import list_cells, list_sweeps, show
 
 
 @pytest.fixture
@@ -32,7 +32,7 @@ def store(tmp_path: Path, cells: Any) -> Store:
 
 
 def chosen(store: Store, **of: object) -> list[str]:
-    return [cell.id for cell in Selection(**of).choose_from(store.cell_rows())]  # type: ignore[arg-type]
+    return [cell.id for cell in Filter(**of, store=store.path).chosen()[1]]  # type: ignore[arg-type]
 
 
 def test_cells_are_chosen_by_name_state_age_and_size(store: Store) -> None:
@@ -41,7 +41,7 @@ def test_cells_are_chosen_by_name_state_age_and_size(store: Store) -> None:
     assert chosen(store, scenes=("fern",)) == ["abc1", "abd2"]
     assert chosen(store, ablations=("mip",)) == ["abd2"]
     assert chosen(store, states=("done",), scenes=("fern",)) == ["abc1"]
-    assert chosen(store, sweeps=(store.sweep_ids()[0],)) == ["abc1", "abd2"]
+    assert chosen(store, sweep=(store.sweep_ids()[0],)) == ["abc1", "abd2"]
     assert chosen(store, older_days=2.9) == ["old3"]
     assert chosen(store, older_days=3.1) == []
     assert chosen(store, larger_mb=2.9) == ["abc1"]
@@ -54,7 +54,7 @@ def test_cells_are_chosen_by_name_state_age_and_size(store: Store) -> None:
         ({"ids": ("x",)}, "x: no cells have such an id"),
         ({"scenes": ("frn",)}, "scenes=frn: no cell has that; choose from: fern, motorcycle"),
         ({"states": ("dun",)}, "states=dun: .*choose from: done, running"),
-        ({"sweeps": ("0",)}, "sweep=0: no cell has that; choose from: [0-9a-f]{16}$"),
+        ({"sweep": ("0",)}, "sweep=0: no cell has that; choose from: [0-9a-f]{16}$"),
     ],
 )
 def test_a_name_of_nothing_is_refused(
@@ -96,7 +96,7 @@ def test_a_cell_is_shown_with_what_differs_from_its_baseline(store: Store, cells
     steps = replace(cells.conf.train, steps=7)
     cell = cells.done(train=steps)
     cells.record((cell.id, "fern", "fewer"), baseline_id="abc1")
-    (row,) = Selection(ids=(cell.id,)).choose_from(store.cell_rows())
+    _, (row,) = Filter((cell.id,), store=store.path).chosen()
     lines = show(store, row).splitlines()
     assert lines[0] == f"cell {cell.id}  fern / fewer / seed 0"
     at = lines.index("differs from its baseline abc1 in:")

@@ -31,12 +31,12 @@ from xrgs.sweep.job import (
     STOPPED,
     STORE_FULL,
     UNWRITABLE,
+    SweepSession,
     WorkError,
     _own_gpu,
     run_hydra_job,
     run_job,
 )
-from xrgs.sweep.session import SweepSession
 
 #: The `Cells` of tests/sweep/conftest.py.
 Cells = Any

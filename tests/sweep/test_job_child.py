@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from xrgs.errors import XrgsError
-from xrgs.runtime import processes
+from xrgs.runtime import machine
 from xrgs.sweep import job
 from xrgs.sweep.job import INTERRUPTED, LOCKED, UNWRITABLE, ProcessEnd, WorkError, run_in_child
 
@@ -85,7 +85,7 @@ def in_this_process(
 ) -> Callable[[Callable[..., dict[str, Any]]], dict[str, Any]]:
     """(work) -> the answer that the child's `main` writes when it does this work."""
     monkeypatch.setattr(job, "follow_parent", lambda: None)
-    monkeypatch.setattr(processes, "offer_to_oom_killer", lambda: None)
+    monkeypatch.setattr(machine, "offer_to_oom_killer", lambda: None)
     monkeypatch.setattr(job, "guard_streams", lambda: None)
     monkeypatch.setattr(faulthandler, "enable", lambda: None)
 

@@ -26,10 +26,9 @@ from xrgs.store.identity import cell_id, cell_identity
 from xrgs.store.store import Store
 from xrgs.sweep import study
 from xrgs.sweep.axes import CellSpec
-from xrgs.sweep.job import INTERRUPTED
+from xrgs.sweep.job import INTERRUPTED, SweepSession
 from xrgs.sweep.launchers import capacity, check, one_cell_a_gpu
 from xrgs.sweep.plan import PlannedCell
-from xrgs.sweep.session import SweepSession
 from xrgs.sweep.study import LOST, Launches
 
 

@@ -6,7 +6,7 @@ import errno
 import json
 from collections.abc import Callable
 
-from xrgs.sweep.session import SweepSession
+from xrgs.sweep.job import SweepSession
 
 
 def signed_by(session: SweepSession, **changes: object) -> SweepSession:

@@ -23,7 +23,7 @@ from xrgs.safeio.atomic import write_json
 from xrgs.safeio.files import walk_files
 from xrgs.store import identity, listing
 from xrgs.store.store import Store
-from xrgs.sweep.status import describe, read, running
+from xrgs.sweep.status import describe, running
 
 
 @pytest.fixture
@@ -54,7 +54,7 @@ def store(cells: Any) -> Store:
 
 
 def test_every_cell_is_counted_and_told_why(store: Store) -> None:
-    text = describe(read(store.path))
+    text = describe(store.path)
     assert "7 cells" in text
     assert "3 done, 1 running, 1 unfinished, 1 failed, 1 corrupt" in text
     assert "1 folder of earlier attempts" in text
@@ -71,7 +71,7 @@ def test_every_cell_is_counted_and_told_why(store: Store) -> None:
     assert {line.strip() for line in done.splitlines()} == {
         *("good  statue / baseline", "stale  statue / consistency", "twice  motorcycle / ?")
     }
-    stale = {cell.id: cell.stale for cell in read(store.path).cells if cell.stale}
+    stale = {cell.id: cell.stale for cell in store.cell_rows() if cell.stale}
     assert stale == {"stale": ("core", "gone")}
     assert "stale: 1 done cell of" in text
     assert "  core: 1 cell" in text
@@ -85,7 +85,7 @@ def test_a_cell_of_another_arithmetic_is_stale(
     for name, arithmetic in (("fused", "fma"), ("unfused", "no-fma"), ("old", "not recorded")):
         cells.done(name, native | {"arithmetic": arithmetic})
     monkeypatch.setattr(listing, "arithmetic", lambda _: "fma")
-    stale = {cell.id: cell.stale for cell in read(store.path).cells}
+    stale = {cell.id: cell.stale for cell in store.cell_rows()}
     assert stale["fused"] == ()
     assert stale["unfused"] == ("arithmetic (no-fma, here fma)",)
     assert stale["old"] == ("arithmetic (not recorded, here fma)",)
@@ -105,9 +105,8 @@ def test_a_cell_that_cannot_be_read_now_is_listed_with_the_reason(
 ) -> None:
     number = errno.ESTALE
     sick("status.json", number)
-    found = read(intact.path)
-    assert {cell.state.name for cell in found.cells} == {"failed"}
-    text = describe(found)
+    assert {cell.state.name for cell in intact.cell_rows()} == {"failed"}
+    text = describe(intact.path)
     assert "\nfailed:\n" in text
     assert f"good/status.json: {os.strerror(number)}" in text
     cells = intact.cells()
@@ -136,7 +135,7 @@ def test_a_folder_that_cannot_be_listed_is_named_and_hides_no_other(
         return listed(of)
 
     monkeypatch.setattr(Path, "iterdir", iterdir)
-    text = describe(read(intact.path))
+    text = describe(intact.path)
     assert (f"  {path}: " in text) == (folder != "locks")
     assert ("3 done" in text) == (folder != "cells")
     assert ("1 sweep recorded" in text) == (folder != "sweeps")
@@ -149,7 +148,7 @@ def test_what_is_no_cell_is_named(intact: Store) -> None:
     (cells / "\x1b[2J").mkdir()
     (intact.path / "variants" / "a-b").write_text("")
     (intact.path / "sweeps" / "pipe.json").mkdir()
-    text = describe(read(intact.path))
+    text = describe(intact.path)
     assert "4 cells\n  3 done, 1 corrupt" in text
     assert "pipe  ? / ?  it is not a folder" in text
     assert text.count("a cell can't have this name") == 2
@@ -161,7 +160,7 @@ def test_what_is_no_cell_is_named(intact: Store) -> None:
     os.mkfifo(intact.path / "cells")
     for path in (intact.path, intact.path / "nowhere"):
         with pytest.raises(XrgsError, match=f"store={path} is not a store"):
-            read(path)
+            describe(path)
 
 
 def test_it_writes_nothing_and_needs_no_torch(
@@ -181,7 +180,7 @@ def test_names_of_a_store_are_not_obeyed_and_stay_on_their_lines(store: Store, c
     cells.done("evil", {"code": code})
     path = store.path.rename(store.path.with_name("s\x1b[2J\nstore s: 99 cells"))
     (path / "folder\x1b[31m\n").mkdir()
-    text = describe(read(path))
+    text = describe(path)
     assert text.replace("\n", "").isprintable()
     assert [line for line in text.split("\n") if line.startswith(("store", "stale:"))] == [
         f"store {path.parent}/s [2J store s: 99 cells: 8 cells",

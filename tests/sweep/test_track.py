@@ -18,7 +18,7 @@ import pytest
 from xrgs.errors import XrgsError
 from xrgs.store.cell_folder import CellFolder, CellState
 from xrgs.store.results import cell_columns
-from xrgs.sweep import track, trackers
+from xrgs.sweep import track
 from xrgs.sweep.axes import CellSpec
 from xrgs.sweep.plan import PlannedCell
 
@@ -216,7 +216,7 @@ def test_a_table_and_a_run_have_the_names_and_settings_of_their_cell(swept: Swep
     swept.tracker("csv", swept.planned("abc", label="=cmd|'x'\x1b")).look()
     (file,) = (swept.store.path / "tracking" / "csv").iterdir()
     rows = list(csv.DictReader(file.read_text().splitlines()))
-    assert rows[0].keys() == {"cell_id", *trackers.NAMES, "series", "step", "value"}
+    assert rows[0].keys() == {"cell_id", *track.NAMES, "series", "step", "value"}
     assert {row["label"] for row in rows} == {"'=cmd|'x'"}, "no formula, no escape"
     assert {row["cell_id"] for row in rows} == {"abc"}
 
@@ -258,19 +258,19 @@ def test_mlflow_shows_how_a_cell_ended(swept: Swept) -> None:
     assert states() == {"done": "FINISHED", "failed": "FAILED", "stopped": "KILLED"}
 
 
-class Broken(trackers.Sink):
+class Broken(track.Sink):
     """A tracker that is away for a while."""
 
     away = True
 
-    def __init__(self, run: trackers.Run, folder: Path) -> None:
+    def __init__(self, run: track.Run, folder: Path) -> None:
         self.check()
 
     def check(self) -> None:
         if self.away:
             raise ConnectionError("no server\x1b[31m")
 
-    def send(self, new: trackers.Curves) -> None:
+    def send(self, new: track.Curves) -> None:
         self.check()
 
     def close(self, state: str) -> None:
@@ -281,7 +281,7 @@ class Broken(trackers.Sink):
 def test_a_failure_is_said_once(
     swept: Swept, again: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setitem(trackers.SINKS, "csv", Broken)
+    monkeypatch.setitem(track.SINKS, "csv", Broken)
     monkeypatch.setattr(Broken, "away", True)
     for name in ("abc", "def"):
         swept.finish(swept.begin(name))
@@ -301,14 +301,14 @@ def test_a_failure_is_said_once(
 def test_an_end_does_not_wait_for_a_server_that_hangs(
     swept: Swept, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    free, sink = threading.Event(), trackers.SINKS["csv"]
+    free, sink = threading.Event(), track.SINKS["csv"]
 
-    def hang(run: trackers.Run, folder: Path) -> trackers.Sink:
+    def hang(run: track.Run, folder: Path) -> track.Sink:
         free.wait()
         return sink(run, folder)
 
     monkeypatch.setattr(track, "_END_S", 0.05)
-    monkeypatch.setitem(trackers.SINKS, "csv", hang)
+    monkeypatch.setitem(track.SINKS, "csv", hang)
     swept.finish(swept.begin("abc"))
     with swept.tracker("csv", swept.planned("abc")):
         pass

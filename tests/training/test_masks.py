@@ -27,7 +27,7 @@ from xrgs.splat.gaussians import Gaussians
 from xrgs.splat.loss import photometric_loss, prepare_target
 from xrgs.splat.rendering import attribute_pixels, rasterize_parameters
 from xrgs.splat.strategy.default import DefaultStrategy
-from xrgs.store.texture import texture
+from xrgs.store.trimming import texture
 from xrgs.training import dataset
 from xrgs.training.components.mip import sampling_rates
 from xrgs.training.components.weighting import _box_mean, mean_gradient, region_attenuations

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
+from xrgs.cli.store import Filter
 from xrgs.errors import StoreError, XrgsError
 from xrgs.formats.files import save_gaussians
 from xrgs.formats.ply import save_ply
 from xrgs.splat.settings import RasterSettings
 from xrgs.store.attempts import begin_attempt
-from xrgs.store.listing import Selection
 from xrgs.store.schema import RecordedCell
 from xrgs.store.store import Store
 from xrgs.viewer import models
@@ -57,8 +57,7 @@ def test_a_cell_is_found_by_its_scene_where_one_is_done(
     (store.cell("abd2").path / "identity.json").write_text("{}")
     assert models.find_cell(str(store.cell("abd2").path), Store("gone")).id == "abd2"
     assert store.find_folder("garden") == store.cell("abc1").path
-    rows = store.cell_rows()
-    assert [row.id for row in Selection(ids=("garden",)).choose_from(rows)] == ["abc1"]
+    assert [row.id for row in Filter(("garden",), store=store.path).chosen()[1]] == ["abc1"]
     for word in (sweep, sweep[:6], "my bike", "photos/garden"):
         assert store.find_sweep(word) == sweep
     with pytest.raises(StoreError, match=r"^house: no sweeps have such an id"):

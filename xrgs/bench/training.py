@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -85,7 +86,7 @@ class TrainingStep:
 
     def densify(self, steps: int = _SETTINGS.every) -> None:
         """Run densification as in steps without refinement."""
-        size = {"width": self.camera.width, "height": self.camera.height}
+        size: dict[str, Any] = {"width": self.camera.width, "height": self.camera.height}
         for step in range(1, steps + 1):
             self.strategy.after_step(step, self.offset.grad, self.rendered.visible, **size)
 

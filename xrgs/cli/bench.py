@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from xrgs.bench.settings import Settings
 from xrgs.cli import options
 from xrgs.runtime.streams import say
@@ -18,6 +20,4 @@ def bench(settings: Settings) -> None:
     say(run(settings))
 
 
-def main() -> None:
-    """Run `xrgs-bench`."""
-    options.run("xrgs-bench", bench)
+main = partial(options.run, "xrgs-bench", bench)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -12,10 +14,11 @@ from tyro.extras import literal_type_from_choices
 from xrgs import config
 from xrgs.cli import options
 from xrgs.cli.options import STORE, Folder, Names, OptionalFolder, shown_as
-from xrgs.cli.photographs import as_they_are, last_of_each_key
 from xrgs.errors import XrgsError
 from xrgs.mixture.paths import is_failed
 from xrgs.mixture.saved_variant import MANIFEST
+from xrgs.photos.images import SUFFIXES
+from xrgs.photos.scenes.folder import VIDEOS
 from xrgs.photos.scenes.scene import ALL_BELOW
 from xrgs.runtime.streams import say
 from xrgs.safeio.paths import user_path
@@ -177,10 +180,8 @@ def form_of(out: Path) -> str:
 def write_export(path: Path, out: Path | None, layout: str = "auto") -> str:
     """Write an export, and return a line for the terminal.
 
-    Args:
-        path: The folder of a cell or a variant, or a file of Gaussians.
-        out: The file or the folder to write; None names it after `path`.
-        layout: The format; `auto` takes `form_of(out)`.
+    `path` is the folder of a cell or a variant, or a file of Gaussians. `out` is the file or the
+    folder to write; None names it after `path`. The layout `auto` is `form_of(out)`.
 
     Raises:
         XrgsError: The export is not possible in this format, or `out` can't be written.
@@ -197,11 +198,36 @@ def write_export(path: Path, out: Path | None, layout: str = "auto") -> str:
     return write(path, layout, out or Path(f"{path.name}-{layout}"))
 
 
-def main() -> None:
-    """Run `xrgs-data`."""
-    options.run(
-        "xrgs-data",
-        {"download": download, "lpips": lpips, "inspect": inspect, "export": export},
-        "Download photographs and the weights of LPIPS, show and export variants.",
-        overrides="inspect",
-    )
+main = partial(
+    options.run,
+    "xrgs-data",
+    {"download": download, "lpips": lpips, "inspect": inspect, "export": export},
+    "Download photographs and the weights of LPIPS, show and export variants.",
+    overrides="inspect",
+)
+
+
+def as_they_are(photographs: str) -> list[str]:
+    """Return the overrides for a folder of photographs, or a video, without any degradation.
+
+    Views are tagged HR and LR by their measured sampling rates.
+
+    Raises:
+        XrgsError: There is no such folder or video.
+    """
+    path = user_path(photographs.removesuffix(ALL_BELOW))
+    if path.suffix.lower() in SUFFIXES and not path.is_dir():
+        raise XrgsError(f"{photographs}: is a photograph; name the folder that it is in")
+    if not path.exists():
+        raise XrgsError(f"{photographs}: there is no such folder or video")
+    kind = "folder" if path.is_dir() else "video"
+    if kind == "video" and path.suffix.lower() not in VIDEOS:
+        raise XrgsError(f"{photographs}: is neither a folder of photographs nor a video")
+    # `factor=1` crops nothing, and with `min_hr=1` two training photographs are enough.
+    variant = ("variant=sampling_rate", "variant.factor=1", "variant.min_hr=1")
+    return [f"scene={kind}", f"scene.path={photographs}", *variant]
+
+
+def last_of_each_key(words: Iterable[str]) -> list[str]:
+    """Keep only the last override of each key: Hydra refuses a group that is given twice."""
+    return list({word.lstrip("+").partition("=")[0]: word for word in words}.values())

@@ -10,10 +10,11 @@ import inspect
 import os
 import re
 import sys
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, get_type_hints
+from typing import Annotated, Any, TypeAlias, get_type_hints
 
 import tyro
 from tyro.conf import CascadeSubcommandArgs, DisallowNone, FlagCreatePairsOff, OmitArgPrefixes, arg
@@ -26,9 +27,6 @@ from xrgs.runtime.streams import guard_streams, say
 from xrgs.safeio.paths import user_path
 from xrgs.safeio.sanitize import for_line
 from xrgs.store.store import DEFAULT_STORE
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 
 STORE = DEFAULT_STORE
 

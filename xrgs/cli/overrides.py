@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import re
 import shlex
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import is_dataclass
 from itertools import accumulate, pairwise
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Quote, QuotedString
+from hydra.core.override_parser.types import Override, Quote, QuotedString
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
@@ -21,12 +22,7 @@ from xrgs.composing import escape_interpolations
 from xrgs.errors import XrgsError, did_you_mean
 from xrgs.photos.scenes.scene import ALL_BELOW
 from xrgs.safeio.paths import user_path
-from xrgs.sweep.axis_values import as_name
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from hydra.core.override_parser.types import Override
+from xrgs.sweep.axes import as_name
 
 #: Hydra's message if a file of the config can't be merged into the others.
 _IN_FILE = re.compile(r"In '([^']+)': \w+ raised while composing config:\n")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -60,6 +61,4 @@ def render(
     say(line)
 
 
-def main() -> None:
-    """Run `xrgs-render`."""
-    options.run("xrgs-render", render)
+main = partial(options.run, "xrgs-render", render)

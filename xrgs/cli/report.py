@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Annotated
 
 from tyro.conf import arg
@@ -73,13 +74,15 @@ def list_sweeps(store: Folder = STORE) -> None:
     Args:
         store: The store.
     """
-    from xrgs.sweep import inventory
+    from xrgs.sweep import status
 
-    say(inventory.list_sweeps(Store(store).sweep_rows()))
+    say(status.list_sweeps(Store(store).sweep_rows()))
 
 
-def main() -> None:
-    """Run `xrgs-report` or `xrgs-report list`."""
-    options.run(
-        "xrgs-report", {"report": report, "list": list_sweeps}, _DESCRIPTION, default="report"
-    )
+main = partial(
+    options.run,
+    "xrgs-report",
+    {"report": report, "list": list_sweeps},
+    _DESCRIPTION,
+    default="report",
+)

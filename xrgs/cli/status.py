@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from xrgs.cli import options
 from xrgs.cli.options import STORE, Flag, Folder
 from xrgs.runtime.streams import say
@@ -17,15 +19,13 @@ def status(store: Folder = STORE, watch: Flag = False) -> None:
         store: The store.
         watch: Show the cells in training, updated until Ctrl-C; the trainings go on after it.
     """
-    from xrgs.sweep.status import describe, read
+    from xrgs.sweep.status import describe
     from xrgs.sweep.status import watch as watch_store
 
     if watch:
         watch_store(store)
     else:
-        say(describe(read(store)))
+        say(describe(store))
 
 
-def main() -> None:
-    """Run `xrgs-status`."""
-    options.run("xrgs-status", status)
+main = partial(options.run, "xrgs-status", status)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
@@ -15,13 +16,9 @@ from xrgs.errors import XrgsError
 from xrgs.runtime.signals import exit_on_signal
 from xrgs.runtime.streams import say
 from xrgs.safeio.sanitize import counted
+from xrgs.store.listing import CellRow
 from xrgs.store.store import Store
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from xrgs.store.listing import CellRow, Selection
-    from xrgs.sweep.cleaning import Plan
+from xrgs.sweep.cleaning import Plan
 
 
 @dataclass(frozen=True)
@@ -45,17 +42,45 @@ class Filter:
     store: Folder = STORE
     """The store."""
 
-    def selection(self) -> Selection:
-        """Convert the options for the functions of `xrgs.store`."""
-        from xrgs.store.listing import Selection
-
-        names = self.ids, self.scenes, self.ablations, self.states, self.sweep
-        return Selection(*names, self.older_days, self.larger_mb)
-
     def chosen(self) -> tuple[list[CellRow], list[CellRow]]:
-        """Return all cells of the store, and the chosen ones."""
+        """Return all cells of the store, and the chosen ones.
+
+        Raises:
+            XrgsError: No cell has a name that is given, or several ids have one beginning.
+        """
+        from xrgs.store.listing import STATES, full_id
+
         cells = Store(self.store).cell_rows()
-        return cells, self.selection().choose_from(cells)
+        done = [cell for cell in cells if cell.state.name == "done"]
+        named = {
+            full_id(
+                word,
+                [cell.id for cell in cells],
+                done={cell.id: cell.arm for cell in done if cell.scene == word},
+            )
+            for word in self.ids
+        }
+        for key, names, existing in (
+            ("scenes", self.scenes, [cell.scene for cell in cells]),
+            ("ablations", self.ablations, [cell.label for cell in cells]),
+            ("states", self.states, STATES),
+            ("sweep", self.sweep, [name for cell in cells for name in cell.sweeps]),
+        ):
+            for name in names:
+                if name not in existing:
+                    choices = ", ".join(dict.fromkeys(existing)) or "none"
+                    raise XrgsError(f"{key}={name}: no cell has that; choose from: {choices}")
+        return cells, [
+            cell
+            for cell in cells
+            if (not named or cell.id in named)
+            and (not self.scenes or cell.scene in self.scenes)
+            and (not self.ablations or cell.label in self.ablations)
+            and (not self.states or cell.state.name in self.states)
+            and (not self.sweep or not {*self.sweep}.isdisjoint(cell.sweeps))
+            and (not self.older_days or (cell.age_s or 0.0) >= 86400 * self.older_days)
+            and (not self.larger_mb or (cell.bytes or 0) >= 1e6 * self.larger_mb)
+        ]
 
 
 @dataclass(frozen=True)
@@ -94,9 +119,9 @@ def list_cells(cells: Filter, sort: Literal["name", "age", "size"] = "name") -> 
         cells: The cells that pass all of these options.
         sort: The order; the oldest or the largest cell is last.
     """
-    from xrgs.sweep import inventory
+    from xrgs.sweep import status
 
-    say(inventory.list_cells(cells.chosen()[1], sort))
+    say(status.list_cells(cells.chosen()[1], sort))
 
 
 def show(cell: Positional[Annotated[str, arg(metavar="CELL")]], store: Folder = STORE) -> None:
@@ -106,10 +131,9 @@ def show(cell: Positional[Annotated[str, arg(metavar="CELL")]], store: Folder = 
         cell: The cell's id, the beginning of its id, or the name of a scene with one done cell.
         store: The store.
     """
-    from xrgs.store.listing import Selection
-    from xrgs.sweep.inventory import show as described
+    from xrgs.sweep.status import show as described
 
-    (chosen,) = Selection(ids=(cell,)).choose_from(Store(store).cell_rows())
+    _, (chosen,) = Filter((cell,), store=store).chosen()
     say(described(Store(store), chosen))
 
 
@@ -122,7 +146,7 @@ def rm(cells: Filter, removal: Removal) -> None:
     """
     from xrgs.sweep.cleaning import plan_removal
 
-    if not cells.selection().restricts:
+    if replace(cells, store=STORE) == Filter():
         raise XrgsError("rm: name cells, or choose them by an option; see xrgs-store rm --help")
     store = Store(cells.store)
     removal.carry_out(store, plan_removal(store, cells.chosen()[1]))
@@ -185,7 +209,7 @@ def import_(
     from xrgs.store import archive
 
     imported = archive.import_store(source, Store(store))
-    say(f"{source}: {imported}")
+    say(f"{source}: imported: {imported}; already there: {imported.present}")
     _say_left(imported.left_out)
 
 
@@ -219,13 +243,13 @@ def rescore(cells: Filter, also: Names = ()) -> None:
         also: Slow scores to add: lpips_vgg, which takes 3 s for a view of 500 x 375 px. Its weights
             are fetched by `xrgs-data lpips --network vgg`.
     """
-    from xrgs.store import rescoring
+    from xrgs.store.scoring import rescore as score_anew
 
     _, chosen = cells.chosen()
     done = [cell.folder for cell in chosen if cell.folder.status_file.exists()]
-    scored = rescoring.rescore(Store(cells.store), done, also)
-    say(str(scored))
-    if scored.left:
+    text, is_complete = score_anew(Store(cells.store), done, also)
+    say(text)
+    if not is_complete:
         sys.exit(1)
 
 
@@ -237,11 +261,11 @@ def check(store: Folder = STORE) -> None:
     Args:
         store: The store.
     """
-    from xrgs.store.verification import describe, verify
+    from xrgs.store.verification import verify
 
-    verification = verify(Store(store))
-    say(describe(verification))
-    if verification.damage:
+    text, damage = verify(Store(store))
+    say(text)
+    if damage:
         sys.exit(1)
 
 

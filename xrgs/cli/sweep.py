@@ -1,27 +1,27 @@
-"""`xrgs-sweep`: plans a sweep and trains its cells; with `rerun=` it trains one cell again."""
+"""`xrgs-sweep`: trains a sweep, or one cell again (`rerun=`), or explains a key (`help=`)."""
 
 from __future__ import annotations
 
 import os
+import re
 import sys
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 import hydra
 from omegaconf import MISSING, DictConfig, OmegaConf
 
 from xrgs import config
-from xrgs.cli.key_help import explain
 from xrgs.cli.options import answer_version, errors_as_messages
 from xrgs.cli.overrides import check_words, explained, files, with_options_first, with_quotes
 from xrgs.composing import escape_interpolations
+from xrgs.errors import XrgsError, did_you_mean
 from xrgs.runtime.signals import exit_on_signal
 from xrgs.runtime.streams import guard_streams, say
 from xrgs.safeio.paths import user_path
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+from xrgs.safeio.records import read_file
 
 #: With this environment variable Hydra leaves errors to its caller.
 _FULL_ERROR = "HYDRA_FULL_ERROR"
@@ -111,12 +111,10 @@ def main() -> None:
 
 
 def run(command: str, words: Sequence[str], hint: str) -> None:
-    """Run a sweep.
+    """Run a sweep with the arguments of `xrgs-sweep`.
 
-    Args:
-        command: Name of the command, which begins messages.
-        words: The arguments of `xrgs-sweep`.
-        hint: The message if a signal ends the sweep: what is kept, and how to continue.
+    `command` begins messages, and `hint` says, if a signal ends the sweep, what is kept and how to
+    continue.
 
     Raises:
         SystemExit: With code 1 if a cell failed; with a message if the user can correct the
@@ -176,3 +174,60 @@ def texts(words: Sequence[str]) -> DictConfig:
         text: Any = escape_interpolations(value)
         OmegaConf.update(conf, key, text)
     return conf
+
+
+_COMMENT = re.compile(r" *# (.*)")
+_KEY = re.compile(r"( *)(\w+):(.*?)(?:  # (.*))?")
+_WHERE = (
+    "Values are those of the baseline. A preset, a scene, a variant or an ablation may set\n"
+    "others; xrgs-sweep --cfg job prints the values in effect."
+)
+
+
+class Entry(NamedTuple):
+    """A key of `conf/config.yaml`."""
+
+    value: str
+    """The value in the baseline, as written; empty for a group of keys."""
+    comment: tuple[str, ...]
+    """The lines of the comments above and behind the key."""
+
+
+def explain(key: str) -> str:
+    """Return a key's value in the baseline and its comment; for a group, also those of its keys.
+
+    Raises:
+        XrgsError: There is no such key; the message offers similar ones.
+    """
+    keys = entries()
+    lines = [
+        "\n  ".join([f"{name}={entry.value}" if entry.value else name, *entry.comment])
+        for name, entry in keys.items()
+        if f"{name}.".startswith(f"{key}.")
+    ]
+    if not lines:
+        raise XrgsError(f"help={key}: there is no such key{did_you_mean(key, keys)}")
+    return "\n\n".join([*lines, _WHERE])
+
+
+def entries() -> dict[str, Entry]:
+    """Read the entries of `conf/config.yaml`, keys and groups of keys, in its order.
+
+    Only the YAML of this file is understood: a key with its value on one line, and two more spaces
+    of indent for the keys of a group.
+    """
+    result: dict[str, Entry] = {}
+    path: list[str] = []
+    above: list[str] = []
+    content = read_file(config.CONF_DIR / "config.yaml").decode()
+    for line in content.partition("\ndefaults:")[2].splitlines():
+        if comment := _COMMENT.fullmatch(line):
+            above.append(comment[1])
+            continue
+        if entry := _KEY.fullmatch(line):
+            indent, name, value, behind = entry.groups()
+            path = [*path[: len(indent) // 2], name]
+            key = ".".join(path)
+            result[key] = Entry(value.strip(), (*above, *([behind] if behind else [])))
+        above = []
+    return result

@@ -1,14 +1,17 @@
 """`xrgs-train`: makes a scene of photographs, or of a video, without degrading them.
 
-It inspects the photographs, finds their cameras, chooses a recipe, and trains one cell by the code
-of `xrgs-sweep`. All its choices are overrides of Hydra, which the user's own overrides replace.
+It inspects the photographs, finds their cameras, chooses a recipe (with --minutes also size and
+steps, by this machine's measured speed), and trains one cell by the code of `xrgs-sweep`. All its
+choices are overrides of Hydra, which the user's own overrides replace.
 """
 
 from __future__ import annotations
 
 import shlex
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from statistics import fmean
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -16,11 +19,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from xrgs import composing
-from xrgs.cli import budget, options, sweep
-from xrgs.cli.data import form_of, write_export
+from xrgs.cli import options, sweep
+from xrgs.cli.data import as_they_are, form_of, last_of_each_key, write_export
 from xrgs.cli.options import STORE, Flag, Folder, OptionalFolder, shown_as
 from xrgs.cli.overrides import check_no_axis, explained, with_quotes
-from xrgs.cli.photographs import as_they_are, last_of_each_key
+from xrgs.config import Conf
 from xrgs.errors import StoreError, XrgsError
 from xrgs.photos import scenes
 from xrgs.runtime.machine import usable_cores
@@ -29,16 +32,13 @@ from xrgs.runtime.streams import say
 from xrgs.runtime.text import format_duration
 from xrgs.safeio.sanitize import counted, for_line
 from xrgs.splat.settings import NOMINAL_STEPS
+from xrgs.store.cell_folder import CellFolder
 from xrgs.store.export import check_place
+from xrgs.store.inspect import Mixture, SfmReport
 from xrgs.store.store import BASELINE, Store
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from xrgs.bench.speed import Trial
-    from xrgs.config import Conf
-    from xrgs.store.cell_folder import CellFolder
-    from xrgs.store.inspect import Mixture, SfmReport
 
 #: --quality -> its overrides.
 _QUALITIES = {
@@ -49,6 +49,18 @@ _QUALITIES = {
 #: Runs of at least _LONG_RUN steps have the settings of `preset=paper`. Shorter runs refine every
 #: _REFINED_EVERY steps, as `preset=laptop` does; more refinements grow more than they can train.
 _LONG_RUN, _REFINED_EVERY = 10_000, 50
+
+
+#: The longer sides of views to choose from, px. A size is worth it from 3,000 steps on at 504 px
+#: (`preset=laptop`); at other sizes in proportion to the number of pixels.
+_SIZES, _AT, _STEPS = (252, 378, 504, 756, 1008), 504, 3000
+#: The fewest steps, whatever the time, and the most, those of the paper.
+_LEAST, _MOST = 200, 30_000
+#: Guesses for unknown views: height over width, and rendered pixels plus Gaussians for each pixel.
+_ASPECT, _UNITS_OF_A_PIXEL = 0.7, 1.5
+#: The share of the whole time for training, before the time for the cameras is known; the share of
+#: the remaining time afterwards; and the seconds for scores and page.
+_TRAINING, _OF_THE_REST, _ENDING_S = 0.6, 0.95, 15.0
 
 
 @dataclass(frozen=True)
@@ -128,7 +140,7 @@ def train(settings: Settings) -> None:
     if settings.recipe:  # a wrong name is found before the cameras are
         _Words(words.given, [*words.own, *_recipe(settings.recipe)]).compose()
     if settings.minutes and settings.size is None:
-        side = budget.size_for(60 * settings.minutes, _measured_unit(words.compose()))
+        side = size_for(60 * settings.minutes, _measured_unit(words.compose()))
         words.own.append(f"variant.long_side={side}")
     with exit_on_signal("Run the same command again to continue."):
         placed = _place(words)
@@ -182,8 +194,8 @@ def _place(words: _Words) -> _Placed | None:
     Raises:
         XrgsError: There are too few photographs, or too few are placed.
     """
-    from xrgs.report.joined import ReportStore
-    from xrgs.store.inspect import mixture
+    from xrgs.store.inspect import mixture, read_report
+    from xrgs.store.trimming import home_of
     from xrgs.sweep import build_variants
     from xrgs.sweep.estimate import read_views
 
@@ -205,7 +217,7 @@ def _place(words: _Words) -> _Placed | None:
     if planned.id is None:
         _say("without --dry-run, their cameras are found, and a recipe is chosen for them")
         return None
-    report = ReportStore(store.path).variant_report(planned.id)
+    report = read_report(home_of(store.variants, planned.id))
     mix = mixture(read_views(store.variants, planned.id))
     _say(f"{name}: the cameras of {report.registered} of {report.images} {kind}s are found")
     _say(
@@ -220,6 +232,27 @@ def _recipe(names: str) -> list[str]:
     if names == BASELINE:
         return []
     return [f"+ablation=[{names}]" if "," in names else f"+ablation={names}", "baseline=false"]
+
+
+def size_for(seconds: float, unit: float) -> int:
+    """Return the longer side of the views, px, for a time, s, that includes finding the cameras.
+
+    `unit` is the seconds per step for each rendered pixel and each Gaussian.
+    """
+    fitting = [
+        size
+        for size in _SIZES
+        if _STEPS * (size / _AT) ** 2 * _ASPECT * size**2 * _UNITS_OF_A_PIXEL * unit
+        <= _TRAINING * seconds
+    ]
+    return max(fitting, default=_SIZES[0])
+
+
+def steps_for(seconds: float, step_s: float) -> int:
+    """Return how many steps of `step_s` seconds fit into the remaining time, to two digits."""
+    count = int((_OF_THE_REST * seconds - _ENDING_S) / step_s)
+    digits: int = 10 ** max(0, len(str(max(count, 0))) - 2)
+    return min(_MOST, max(_LEAST, count // digits * digits))
 
 
 def _measured_unit(conf: Conf) -> float:
@@ -239,7 +272,7 @@ def _trial(placed: _Placed, conf: Conf) -> Trial:
 def _choose_steps(words: _Words, settings: Settings, step_s: float, left_s: float) -> None:
     """Choose the steps for the remaining time, and print a command that repeats this training."""
     conf = words.compose()
-    steps = budget.steps_for(left_s, step_s)
+    steps = steps_for(left_s, step_s)
     quality = "high" if steps >= _LONG_RUN else "normal"
     side = conf.variant.long_side
     words.own += [*_QUALITIES[quality], f"variant.long_side={side}", f"train.steps={steps}"]
@@ -254,7 +287,7 @@ def _choose_steps(words: _Words, settings: Settings, step_s: float, left_s: floa
 
 def _expected_s(placed: _Placed, conf: Conf, trial: Trial | None) -> float:
     """Return the expected seconds of a training, by the trial, finished cells or a measurement."""
-    from xrgs.sweep.estimate import CostEstimator
+    from xrgs.sweep.estimate import CostEstimator, units_of_a_step
 
     if trial is not None:
         return trial.start_s + conf.train.steps * trial.step_s
@@ -262,19 +295,14 @@ def _expected_s(placed: _Placed, conf: Conf, trial: Trial | None) -> float:
     cost = CostEstimator(Store(conf.store)).cost(conf, placed.variant_id, threads)
     if cost is not None:
         return cost.seconds
-    return conf.train.steps * _measured_unit(conf) * _units_of_a_step(placed, conf)
-
-
-def _units_of_a_step(placed: _Placed, conf: Conf) -> float:
-    from xrgs.sweep.estimate import units_of_a_step
-
-    return units_of_a_step(Store(conf.store), conf, placed.variant_id)
+    units = units_of_a_step(Store(conf.store), conf, placed.variant_id)
+    return conf.train.steps * _measured_unit(conf) * units
 
 
 def _say_end(placed: _Placed, conf: Conf, settings: Settings, seconds: float) -> None:
     """Print the result, its page and the next commands, in at most eight lines."""
     from xrgs.report.page import PAGE
-    from xrgs.sweep.ending import next_commands
+    from xrgs.sweep.status import next_commands
 
     store, name = Store(conf.store), scenes.label(conf.scene)
     cell = _cell(placed, conf)
@@ -315,6 +343,4 @@ def _say(line: str) -> None:
     say(for_line(line))
 
 
-def main() -> None:
-    """Run `xrgs-train`."""
-    options.run("xrgs-train", train, overrides="xrgs-train")
+main = partial(options.run, "xrgs-train", train, overrides="xrgs-train")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from contextlib import suppress
+from functools import partial
 
 from tyro.conf import Positional
 
@@ -48,6 +49,4 @@ def view(
                 threading.Event().wait()
 
 
-def main() -> None:
-    """Run `xrgs-view`."""
-    options.run("xrgs-view", view)
+main = partial(options.run, "xrgs-view", view)

@@ -6,15 +6,12 @@ Averages are taken of the effect of a pair: a difference in dB, or log(value / b
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Collection
 
 import numpy as np
 import pandas as pd
 
 from xrgs.report.inference import half_width, p_values, prediction_half_width, sign_test
-
-if TYPE_CHECKING:
-    from collections.abc import Collection
 
 _SCENE = ["label", "condition", "scene", "metric"]
 _MEAN = ["label", "condition", "metric"]

@@ -1,51 +1,43 @@
-"""Reads the cells of a sweep from the store into tables. Nothing is trained or scored.
+"""Reads the records and the cells of a report's sweeps into tables; nothing is trained or scored.
 
-A cell that is not done becomes a row with its state and the reason, so that a report shows it.
+A study may be trained in parts, for example scene by scene: its report needs the rows of all
+records. A cell that is not done becomes a row with its state and the reason, so that a report shows
+it.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
+from pathlib import Path
 from statistics import fmean
-from typing import TYPE_CHECKING, Any
+from types import MappingProxyType
+from typing import Any
 
 import msgspec
 import numpy as np
 import pandas as pd
 
+from xrgs.composing import dotted
+from xrgs.config import Conf
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.evaluation.metrics import METRICS, ON_REQUEST, VIEW_METRICS
 from xrgs.runtime.progress import progress
-from xrgs.safeio.records import as_number, read_table
-from xrgs.safeio.sanitize import for_line
-from xrgs.store.cell_folder import CellState
+from xrgs.safeio.sanitize import for_file_name, for_line
+from xrgs.store.cell_folder import CellFolder, CellState, number_columns
+from xrgs.store.inspect import SfmReport
 from xrgs.store.provenance import machine
 from xrgs.store.results import over_views
+from xrgs.store.schema import Identity, Provenance, RecordedCell, Status, Summary
 from xrgs.store.scoring import PROTOCOL, stale_scores, without_refactorings
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-    from pathlib import Path
-
-    from xrgs.config import Conf
-    from xrgs.store.cell_folder import CellFolder
-    from xrgs.store.inspect import SfmReport
-    from xrgs.store.schema import Identity, Provenance, RecordedCell, Status, Summary
-    from xrgs.store.store import Store
+from xrgs.store.store import BASELINE, Store
 
 #: The columns of a sweep's record, which has a row for each planned cell.
 RECORD_KEYS = [
-    "scene",
-    "condition",
-    "label",
-    "variant_seed",
-    "seed",
-    "cell_id",
-    "variant_id",
-    "baseline_id",
-    "error",
+    *("scene", "condition", "label", "variant_seed", "seed"),
+    *("cell_id", "variant_id", "baseline_id", "error"),
 ]
 #: The columns that name a cell in tables of training and curves.
 CELL_KEYS = ["cell_id", "scene", "label", "condition", "variant_seed", "seed"]
@@ -114,7 +106,7 @@ class Sweep:
     has no such cells (`xrgs.report.external`)."""
     variants: dict[str, SfmReport] = field(default_factory=dict)
     """The SfM reports of the done cells' variants, by the variant's id
-    (`xrgs.report.photographs`)."""
+    (`xrgs.report.context`)."""
 
     @property
     def id(self) -> str:
@@ -126,8 +118,9 @@ class Sweep:
         """Provenance of the done cells: the distinct values of each entry, sorted."""
         distinct: dict[str, set[str]] = {}
         for cell in self.done.values():
-            for key, value in _provenance_entries(cell.provenance):
-                distinct.setdefault(key, set()).add(value)
+            for key, value in dotted(msgspec.structs.asdict(cell.provenance)):
+                if key != "started":
+                    distinct.setdefault(key, set()).add(str(value))
         return {key: sorted(values) for key, values in sorted(distinct.items())}
 
 
@@ -191,20 +184,6 @@ def _read_done(cell: CellFolder) -> DoneCell:
     )
 
 
-def number_columns(file: Path) -> dict[str, list[float]]:
-    """Read a table of numbers by columns, without the column `view`, which is text.
-
-    Raises:
-        StoreError: The file is missing or damaged, or a value is not a number.
-    """
-    header, rows = read_table(file)
-    places = [(place, name) for place, name in enumerate(header) if name != "view"]
-    try:
-        return {name: [as_number(row[place]) for row in rows] for place, name in places}
-    except ValueError as error:
-        raise StoreError(f"damaged: {file}: {error}") from error
-
-
 def _totals(history: Mapping[str, list[float]]) -> dict[str, float]:
     """Return `DoneCell.totals`."""
     totals = {}
@@ -228,11 +207,7 @@ def is_component_log(column: str) -> bool:
 def _curve(
     file: Path, summary: Summary, views: list[tuple[str, dict[str, float]]]
 ) -> list[dict[str, float]]:
-    """Return `DoneCell.curve`; a missing score is NaN.
-
-    Raises:
-        StoreError: The file is damaged, or lacks a column.
-    """
+    """Return `DoneCell.curve`; a missing score is NaN. StoreError says that the file is damaged."""
     last: dict[str, float] = {
         "step": summary.steps,
         "seconds": summary.training_time_s,
@@ -278,10 +253,10 @@ def _done_columns(cell_id: str, cell: DoneCell) -> dict[str, Any]:
 
 
 @cache
-def _scored(*digests: tuple[str, str]) -> tuple[dict[str, str], str]:
+def _scored(*digests: tuple[str, str]) -> tuple[Mapping[str, str], str]:
     """Return the digests of scores without refactorings, and the names of the stale scores."""
     scored_by = without_refactorings(dict(digests))
-    return scored_by, " ".join(stale_scores(scored_by))
+    return MappingProxyType(scored_by), " ".join(stale_scores(scored_by))
 
 
 def _views(done: Mapping[str, DoneCell]) -> pd.DataFrame:
@@ -303,7 +278,7 @@ def _cells(
     numbers = ["validation", "steps", "long_side", "factor", *(metric.name for metric in METRICS)]
     entries = [
         {key: getattr(row, key) for key in RECORD_KEYS}
-        | (columns[row.cell_id] if row.cell_id is not None else _without_cell(row))
+        | (columns[row.cell_id] if row.cell_id else _without_cell(row))
         for row in rows
     ]
     cells = pd.DataFrame(entries, columns=[*RECORD_KEYS, *texts, *numbers])
@@ -340,10 +315,110 @@ def _check_identity(
                 )
 
 
-def _provenance_entries(provenance: Provenance) -> Iterable[tuple[str, str]]:
-    """Yield the entries of a cell's provenance, without the time of its start."""
-    for key, value in msgspec.structs.asdict(provenance).items():
-        if isinstance(value, dict):
-            yield from ((f"{key}.{name}", str(inner)) for name, inner in value.items())
-        elif key != "started":
-            yield key, str(value)
+#: The most ids in the name of a report's folder.
+_MAX_LISTED = 4
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The scenes and ablations that a report shows."""
+
+    scenes: tuple[str, ...] = ()
+    """Names of scenes; empty for all."""
+    ablations: tuple[str, ...] = ()
+    """Labels of ablations and controls, beside their base; empty for all."""
+
+    def rows(self, rows: Sequence[RecordedCell], against: str) -> list[RecordedCell]:
+        """Return the chosen rows of a record; those of `against` and the baseline stay.
+
+        Raises:
+            ReportError: No row has a chosen scene or label; the message lists the existing ones.
+        """
+        _check_known("scenes", self.scenes, [row.scene for row in rows])
+        _check_known("ablations", self.ablations, [row.label for row in rows])
+        labels = {*self.ablations, against, BASELINE}
+        return [
+            row
+            for row in rows
+            if (not self.scenes or row.scene in self.scenes)
+            and (not self.ablations or row.label in labels)
+        ]
+
+    @property
+    def suffix(self) -> str:
+        """The end of the report's folder name that tells the choice; empty if all is chosen."""
+        parts = (("scenes", self.scenes), ("ablations", self.ablations))
+        return "".join(f".{key}-{for_file_name(','.join(names))}" for key, names in parts if names)
+
+
+def _check_known(key: str, wanted: Iterable[str], choices: Sequence[str]) -> None:
+    for name in wanted:
+        if name not in choices:
+            raise ReportError(
+                f"{key}={name}: the sweep has none of that name; choose from:"
+                f" {', '.join(dict.fromkeys(choices))}"
+            )
+
+
+class ReportStore(Store):
+    """A store with the renders of other programs, from which a report is made."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self.external: Mapping[str, Path] = {}
+        """Folders of another program's renders, see `Sweep.renders`."""
+
+    def render(self, cell_id: str, view: str) -> Path:
+        """Return the file of a view's render, which need not exist; StoreError if it is trimmed."""
+        if cell_id in self.external:
+            return self.external[cell_id] / f"{view}.png"
+        cell, name = self.cell(cell_id), f"renders/{view}.png"
+        cell.check_not_trimmed(name)
+        return cell.path / name
+
+    def without_paths(self, text: str) -> str:
+        """Remove the store's path from a text, so that reports don't depend on it."""
+        return text.replace(f"{self.path}/", "")
+
+    def sweep_records(
+        self, sweep_ids: Sequence[str]
+    ) -> tuple[dict[str, tuple[str, ...]], list[RecordedCell]]:
+        """Return the command of each sweep, by its id, and the rows of all records, each run once.
+
+        Raises:
+            StoreError: There is no such sweep, or its record is damaged.
+            ReportError: Two records have different cells for one run; the message names both.
+        """
+        commands: dict[str, tuple[str, ...]] = {}
+        rows: dict[tuple[object, ...], tuple[str, RecordedCell]] = {}
+        for sweep_id in sweep_ids:
+            record = self.sweep_record(sweep_id)
+            commands[sweep_id] = record.command
+            for row in record.cells:
+                key = (row.scene, row.condition, row.label, row.variant_seed, row.seed)
+                rows[key] = sweep_id, _fuller(rows.get(key), sweep_id, row)
+        return commands, [row for _, row in rows.values()]
+
+
+def _fuller(old: tuple[str, RecordedCell] | None, sweep_id: str, row: RecordedCell) -> RecordedCell:
+    """Return, of two rows for one run, the one with a cell id; refuse two different cells."""
+    if old is None or old[1].cell_id is None:
+        return row
+    before, first = old
+    if row.cell_id in {None, first.cell_id}:
+        return first
+    name = " / ".join(filter(None, (row.scene, row.label, row.condition)))
+    raise ReportError(
+        f"{name} / seed {row.seed} is cell {first.cell_id} in sweep {before} and"
+        f" {row.cell_id} in sweep {sweep_id}: they differ in configuration, code or variant."
+        " Leave one of the sweeps out, or choose rows with --scenes and --ablations. To compare two"
+        " values of a setting, run xrgs-sweep with both as an axis: finished cells are not trained"
+        " again"
+    )
+
+
+def report_name(sweep_ids: Sequence[str]) -> str:
+    """Return the name of a report's folder: the ids of its sweeps, joined by `+`."""
+    more = len(sweep_ids) - _MAX_LISTED
+    listed = "+".join(sweep_ids[:_MAX_LISTED])
+    return f"{listed}+{for_file_name(' '.join(sweep_ids[_MAX_LISTED:]))}" if more > 0 else listed

@@ -13,12 +13,14 @@ for scores of views, since a gap in seconds or Gaussians means nothing.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
+from xrgs.evaluation.metrics import Metric
 from xrgs.report.averages import averaged
 from xrgs.report.collect import ReportError
 from xrgs.report.inference import (
@@ -26,6 +28,7 @@ from xrgs.report.inference import (
     OTHER_CODE,
     OTHER_MACHINE,
     OTHER_THREADS,
+    Floats,
     difference,
     equivalence,
     false_discovery_rates,
@@ -35,14 +38,6 @@ from xrgs.report.inference import (
 )
 from xrgs.store.provenance import without_threads
 from xrgs.store.store import BASELINE
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from numpy.typing import NDArray
-
-    from xrgs.evaluation.metrics import Metric
-    from xrgs.report.inference import Floats
 
 _GROUP = ["label", "condition"]
 #: The units of the metrics that depend on the machine.

@@ -1,29 +1,25 @@
-"""The context of a table: how its cells were trained and scored, and cautions.
-
-Tables show it in all formats: text, Markdown, LaTeX and HTML.
-"""
+"""The context of a table: how its cells were trained and scored, cautions, and photographs."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
 
+from xrgs.config import Conf, VariantConf
+from xrgs.errors import StoreError
 from xrgs.mixture.degradations import DEGRADATIONS, resolve_degradation
+from xrgs.report.collect import ReportStore, Sweep
+from xrgs.report.compare import Comparison
 from xrgs.report.inference import OTHER_CODE
 from xrgs.report.writing import signed
 from xrgs.runtime.text import listed
 from xrgs.safeio.sanitize import counted, for_line
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-
-    from xrgs.config import Conf, VariantConf
-    from xrgs.report.collect import Sweep
-    from xrgs.report.compare import Comparison
-    from xrgs.store.schema import Provenance
+from xrgs.store.inspect import SfmReport, read_report
+from xrgs.store.schema import Provenance
+from xrgs.store.trimming import home_of
 
 #: Scores of fewer views than this say little: one more view may reverse their order.
 _ENOUGH_VIEWS = 3
@@ -60,11 +56,6 @@ class Context:
         return "; ".join((*self.training, *self.machine))
 
 
-def context_of(contexts: Mapping[str, Context], condition: str) -> Context:
-    """Return the context of a condition; an empty one if none is known."""
-    return contexts.get(condition, Context())
-
-
 def contexts(sweep: Sweep) -> dict[str, Context]:
     """Return the context of each condition; an empty one without finished cells."""
     cells = sweep.cells
@@ -80,11 +71,13 @@ def contexts(sweep: Sweep) -> dict[str, Context]:
         configs = [cell.config for cell in trained]
         reports = [sweep.variants.get(name) for name in rows["variant_id"]]
         tagged = not all(report and report.alike for report in reports)
-        held_out = bool((rows["validation"] > 0).any())
+        least, most = min(tests.values()), max(tests.values())
+        count = f"{least}" if least == most else f"{least} to {most}"
+        kind = "held-out training view" if (rows["validation"] > 0).any() else "test view"
         by_condition[str(condition)] = Context(
             (
                 *_sizes([config for config in configs if config], tagged=tagged),
-                _scored_views(tests, held_out=held_out),
+                f"{count} {kind}{'s' * (most != 1)}{' a scene' * (len(tests) > 1)}",
                 *_prune_rule(zip(rows["label"], configs, strict=True)),
             ),
             _machine([cell.provenance for cell in trained]),
@@ -121,13 +114,6 @@ def _sizes(configs: Sequence[Conf], *, tagged: bool) -> list[str]:
         "HR views at the photographs' size" if sizes == "0" else f"HR views of at most {sizes} px",
         " or ".join(dict.fromkeys(_mixture(config.variant) for config in configs)),
     ]
-
-
-def _scored_views(tests: Mapping[str, int], *, held_out: bool) -> str:
-    least, most = min(tests.values()), max(tests.values())
-    count = f"{least}" if least == most else f"{least} to {most}"
-    kind = "held-out training view" if held_out else "test view"
-    return f"{count} {kind}{'s' * (most != 1)}{' a scene' * (len(tests) > 1)}"
 
 
 def _mixture(variant: VariantConf) -> str:
@@ -232,14 +218,11 @@ _MIN_DISTANCE = 3.0
 def decided_by_one_view(
     comparison: Comparison, views: pd.DataFrame
 ) -> dict[tuple[str, str], list[str]]:
-    """Warn of pairs where one view decides the change in PSNR.
+    """Warn of pairs where one view decides the change in PSNR, by label and condition.
 
     A scene has few test views, and PSNR has no bound: a floater in front of one test camera can
-    cost its view 10 dB, which is more than all other views gain together.
-
-    Returns:
-        (label, condition) -> a sentence for each such pair: the view, and the change with and
-        without it.
+    cost its view 10 dB, which is more than all other views gain together. A sentence names the
+    view, and the change with and without it.
     """
     changes = _changes_of_views(comparison, views)
     pairs = _with_and_without(changes)
@@ -297,3 +280,57 @@ def _with_and_without(changes: pd.DataFrame) -> pd.DataFrame:
         spread=spread.groupby([others[key] for key in _PAIR], sort=False).max(),
     )
     return pairs.reset_index()
+
+
+#: The most names in a sentence on views that are not placed.
+_MAX_NAMES = 200
+
+
+def with_variants(sweep: Sweep, store: ReportStore) -> Sweep:
+    """Return a sweep with the SfM reports of its finished cells' variants.
+
+    If a report can't be read, its note says so.
+    """
+    done = sweep.cells[sweep.cells["cell_id"].isin(sweep.done)]
+    reports = {}
+    for variant_id in done["variant_id"].unique():
+        try:
+            reports[variant_id] = read_report(home_of(store.variants, variant_id))
+        except StoreError as error:
+            why = store.without_paths(str(error))
+            reports[variant_id] = SfmReport(notes=(f"unknown what was done with them: {why}",))
+    return replace(sweep, variants=reports)
+
+
+def photographs(sweep: Sweep) -> list[tuple[str, tuple[str, ...]]]:
+    """Return (scene, sentences on its photographs) for the scenes with finished cells.
+
+    They come from all variants of the scene, and from its cells' trainings (blur, exposure).
+    """
+    done = sweep.cells[sweep.cells["variant_id"].isin(sweep.variants)]
+    by_scene = []
+    for scene, rows in done.groupby("scene", sort=False):
+        variants = [sweep.variants[name] for name in rows["variant_id"].unique()]
+        notes = [note for variant in variants for note in variant.all_notes(_MAX_NAMES)]
+        several = len(rows[["variant_seed", "seed"]].drop_duplicates()) > 1
+        for row in rows[rows["cell_id"].isin(sweep.done)].to_dict("records"):
+            replicate = f"replicate {row['variant_seed']}/{row['seed']}" * several
+            name = ", ".join(filter(None, (row["label"], row["condition"], replicate)))
+            notes += [f"{name}: {line}" for line in sweep.done[row["cell_id"]].summary.found]
+        by_scene.append((str(scene), tuple(dict.fromkeys(notes))))
+    return [(scene, notes) for scene, notes in by_scene if notes]
+
+
+def placement(sweep: Sweep, scene: str) -> str:
+    """Say how the photographs of a scene were placed, from the report of its first variant."""
+    rows = sweep.cells[(sweep.cells["scene"] == scene)]
+    reports = [sweep.variants[name] for name in rows["variant_id"] if name in sweep.variants]
+    if not reports or not reports[0].images:
+        return "it is unknown how the photographs were placed"
+    report = reports[0]
+    by = "structure from motion" if report.poses is None else "the cameras that were given"
+    error = report.reprojection_error_px
+    parts = [f"{report.registered} of {report.images} photographs are placed by {by}"]
+    parts += [f"{report.points:,} points"] if report.points else []
+    parts += [] if error is None else [f"mean reprojection error {error:.2f} px"]
+    return ", ".join(parts)

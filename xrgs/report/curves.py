@@ -6,18 +6,13 @@ A cell trained with `train.evaluate_every=N` has the mean scores of its test vie
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Mapping, Sequence
 
 import pandas as pd
 
-from xrgs.report.collect import CELL_KEYS, CURVE_COLUMNS
+from xrgs.report.collect import CELL_KEYS, CURVE_COLUMNS, DoneCell
 from xrgs.report.markup import titled
 from xrgs.runtime.text import TextTable
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-
-    from xrgs.report.collect import DoneCell
 
 _NOT_REACHED = "not reached"
 
@@ -25,8 +20,7 @@ _NOT_REACHED = "not reached"
 def joined(cells: pd.DataFrame, done: Mapping[str, DoneCell]) -> pd.DataFrame:
     """Join the curves of all of `Comparison.cells` that were evaluated during training.
 
-    Returns:
-        One row for each evaluation, with `CELL_KEYS` and `CURVE_COLUMNS`, by cell and step.
+    There is a row for each evaluation, with `CELL_KEYS` and `CURVE_COLUMNS`, by cell and step.
     """
     rows = [
         {"cell_id": cell_id, **row}
@@ -39,11 +33,10 @@ def joined(cells: pd.DataFrame, done: Mapping[str, DoneCell]) -> pd.DataFrame:
 
 
 def means_over_runs(curves: pd.DataFrame, condition: str) -> pd.DataFrame:
-    """Average the curves of one condition, as `joined` returns them, over runs.
+    """Average the curves of one condition, as `joined` returns them, over the runs of a scene.
 
-    Returns:
-        Columns `label`, `scene` and `CURVE_COLUMNS`; one row for each step at which all runs of a
-        scene and label were evaluated, in the order of the labels.
+    The columns are `label`, `scene` and `CURVE_COLUMNS`, with a row for each step at which all runs
+    of a scene and label were evaluated, in the order of the labels.
     """
     return _means(curves[curves["condition"] == condition], ["label", "scene"])
 
@@ -51,8 +44,7 @@ def means_over_runs(curves: pd.DataFrame, condition: str) -> pd.DataFrame:
 def means_over_scenes(scenes: pd.DataFrame) -> pd.DataFrame:
     """Average the curves of `means_over_runs` over the scenes that all labels have.
 
-    Returns:
-        Columns `label` and `CURVE_COLUMNS`; no row if no scene has all labels.
+    The columns are `label` and `CURVE_COLUMNS`; there is no row if no scene has all labels.
     """
     labels = scenes.groupby("scene")["label"].nunique()
     common = labels.index[labels == scenes["label"].nunique()]
@@ -69,16 +61,11 @@ def _means(rows: pd.DataFrame, by: list[str]) -> pd.DataFrame:
 
 
 def first_reaches(quality: Sequence[float], amounts: Sequence[float], target: float) -> float:
-    """Return the amount at which a curve first reaches a target.
+    """Return the amount of time or work at which a curve first reaches a quality, higher is better.
 
-    Args:
-        quality: Quality at each evaluation, NaN if not measured; higher is better.
-        amounts: Time or work so far at each evaluation.
-        target: The quality to reach.
-
-    Returns:
-        The amount, interpolated linearly between the first evaluation that reaches the target and
-        the one before it. If the first evaluation reaches it, its amount; NaN if none does.
+    It is interpolated linearly between the first evaluation that reaches the target and the one
+    before it. If the first evaluation reaches it, it is its amount; NaN if none does. A quality of
+    NaN was not measured.
 
     Examples:
         >>> first_reaches([20.0, 22.0, 21.0], [10.0, 20.0, 30.0], 21.5)
@@ -99,13 +86,12 @@ def first_reaches(quality: Sequence[float], amounts: Sequence[float], target: fl
 def times(cells: pd.DataFrame, done: Mapping[str, DoneCell]) -> pd.DataFrame:
     """Return the time and work in which each of `Comparison.cells` reaches its base's final PSNR.
 
-    Returns:
-        One row for each cell that was evaluated during training and whose base is done:
-        `CELL_KEYS`; `target`, the base's final PSNR of this scene and replicate, dB; `evaluations`
-        and `seconds` until the mean PSNR of the test views first reaches the target, NaN if it
-        never does. Each of the two also has a ratio `_share`, to the base's whole training, and
-        `_own_share`, to what the base takes until it first reaches its own final PSNR (it may pass
-        that early and fall again). If the base ran on another machine, the ratios of time are NaN.
+    There is a row for each cell that was evaluated during training and whose base is done, with
+    `CELL_KEYS`, the `target` (dB), and `evaluations` and `seconds` until the mean PSNR of the test
+    views first reaches it, NaN if it never does. Each of the two also has a ratio `_share`, to the
+    base's whole training, and `_own_share`, to what the base takes until it first reaches its own
+    final PSNR (it may pass that early and fall again). If the base ran on another machine, the
+    ratios of time are NaN.
     """
     rows = []
     finished = cells[cells["cell_id"].isin(done)].drop_duplicates(CELL_KEYS)

@@ -8,8 +8,10 @@ and memory (`Figures`).
 
 from __future__ import annotations
 
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Any
+from pathlib import Path
+from typing import Annotated, Any
 
 import msgspec
 import pandas as pd
@@ -19,7 +21,7 @@ from xrgs.evaluation.metrics import VIEW_METRICS
 from xrgs.evaluation.protocol import score_file
 from xrgs.mixture import variant
 from xrgs.photos.images import ImageError
-from xrgs.report.collect import ReportError, Sweep
+from xrgs.report.collect import ReportError, ReportStore, Sweep
 from xrgs.runtime.progress import progress
 from xrgs.safeio.files import is_inside
 from xrgs.safeio.paths import user_path
@@ -27,13 +29,6 @@ from xrgs.safeio.records import read_struct
 from xrgs.safeio.sanitize import for_file_name
 from xrgs.store.results import over_views
 from xrgs.store.scoring import scoring_code
-
-if TYPE_CHECKING:
-    from collections.abc import Hashable, Mapping, Sequence
-    from pathlib import Path
-
-    from xrgs.mixture.views import View
-    from xrgs.report.joined import ReportStore
 
 #: Another program's renders become one row for each combination of these columns.
 _VARIANT = ["scene", "condition", "variant_seed"]
@@ -63,10 +58,7 @@ class External:
 
 
 def parse(words: Sequence[str]) -> tuple[External, ...]:
-    """Read the words of `xrgs-report --external LABEL:FOLDER LABEL:FOLDER`.
-
-    Args:
-        words: Folders, each as `LABEL:FOLDER`, or only `FOLDER`, whose name is then the label.
+    """Read the words of `xrgs-report --external`: LABEL:FOLDER, or a folder that is its own label.
 
     Raises:
         ReportError: A label or a folder is empty, or two labels are the same.
@@ -91,19 +83,10 @@ def parse(words: Sequence[str]) -> tuple[External, ...]:
 def with_external(sweep: Sweep, store: ReportStore, externals: Sequence[External]) -> Sweep:
     """Return a sweep with one more row for each variant that another program has rendered.
 
-    A program has one set of renders for a variant. In each condition, they are compared with the
+    A program has one set of renders for a variant: `<view>.png` for each scored view, in the folder
+    `<scene>/<variant.seed>/`. If a scene has one draw of HR views, `<scene>/` will do, and if the
+    sweep also has only one scene, the folder itself. In each condition they are compared with the
     cells of the lowest seed.
-
-    Args:
-        sweep: The sweep.
-        store: The stores that have the sweep's variants.
-        externals: The programs' renders: `<view>.png` for each scored view, in the folder
-            `<scene>/<variant.seed>/`. If a scene has one draw of HR views, `<scene>/` will do, and
-            if the sweep also has only one scene, the folder itself. `figures.json` beside them may
-            have numbers of the training.
-
-    Returns:
-        The sweep with these rows in `cells` and `views`, and their folders in `renders`.
 
     Raises:
         ReportError: Cells already have the label, a folder or a render is missing, or a render is
@@ -134,7 +117,16 @@ def _with_program(sweep: Sweep, store: ReportStore, program: External) -> Sweep:
         expected = {view.name: view for view in variant_views if view.split == split}
         bar = progress(list(views), f"scoring {program.label}", "view")
         masked = any(expected[name].mask for name in views)
-        scores += [{"cell_id": cell_id} | _score(folder, expected[name], masked) for name in bar]
+        for name in bar:
+            view, file = expected[name], folder / f"{name}.png"
+            try:
+                scored = score_file(file, view, masked=masked)
+            except ImageError as error:
+                wanted = f"an 8-bit RGB PNG of {view.width} x {view.height} px"
+                raise ReportError(
+                    f"{error}; expected is {wanted}, the render of the view {name}"
+                ) from error
+            scores.append({"cell_id": cell_id, "view": name} | scored)
         renders[cell_id] = folder
         file = folder / FIGURES
         figures = read_struct(file, Figures) if file.exists() else Figures()
@@ -180,13 +172,3 @@ def _folder(program: External, cell: Mapping[Hashable, Any], done: pd.DataFrame)
             f"{expected} is expected, with <view>.png for each view that is scored"
         )
     return existing[0]
-
-
-def _score(folder: Path, view: View, masked: bool) -> dict[str, Any]:
-    """Score the render of a view against its photograph."""
-    file = folder / f"{view.name}.png"
-    wanted = f"expected is an 8-bit RGB PNG of {view.width} x {view.height} px, the render of the"
-    try:
-        return {"view": view.name} | score_file(file, view, masked=masked)
-    except ImageError as error:
-        raise ReportError(f"{error}; {wanted} view {view.name}") from error

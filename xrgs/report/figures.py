@@ -9,30 +9,26 @@ from __future__ import annotations
 
 import io
 import warnings
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 from matplotlib import style
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import EngFormatter, LogLocator, NullLocator
+from numpy.typing import NDArray
 
+from xrgs.evaluation.metrics import Metric
 from xrgs.photos.images import SOFTWARE
 from xrgs.report.writing import named
 from xrgs.safeio.sanitize import MAX_CELL, for_line
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-
-    import pandas as pd
-    from matplotlib.axes import Axes
-    from matplotlib.lines import Line2D
-    from numpy.typing import NDArray
-
-    from xrgs.evaluation.metrics import Metric
-
-    Image = NDArray[np.float32]
+Image = NDArray[np.float32]
 
 #: Okabe and Ito's orange and blue, which colour-blind readers can distinguish, also in grey.
 _ABLATION, _BASELINE, _FRAME = "#D55E00", "#0072B2", "#FFD400"
@@ -81,15 +77,9 @@ def _default_style() -> Iterator[None]:
 
 
 def differing_crop(first: Image, second: Image, zoom: int = _ZOOM) -> tuple[slice, slice]:
-    """Find the window, `zoom` times smaller than two images, in which they differ most.
+    """Find the window, `zoom` times smaller than two images [H, W, 3], in which they differ most.
 
-    Args:
-        first: [H, W, 3] in 0..1.
-        second: [H, W, 3] in 0..1.
-        zoom: The ratio of the images' sides to the window's.
-
-    Returns:
-        The window's rows and columns; of equally different windows, the topmost, then the leftmost.
+    Return its rows and columns; of equally different windows, the topmost, then the leftmost.
     """
     difference = np.abs(first.astype(np.float64) - second).mean(axis=2)  # [H, W]
     height, width = (max(1, side // zoom) for side in difference.shape)
@@ -301,7 +291,11 @@ def dependence(title: str, key: str, changes: pd.DataFrame, axes: Sequence[Metri
             _dependence_line(panel, rows[rows["series"] == name], look)
             for name, look in zip(series, _ARMS[1:], strict=False)
         ]
-        _scaled(panel, sorted(rows["value"].unique()))
+        values = sorted(rows["value"].unique())
+        if values[0] > 0 and values[-1] >= _LOG_FROM * values[0]:
+            panel.set_xscale("log")
+            panel.xaxis.set_minor_locator(NullLocator())
+        panel.set_xticks(values, [f"{value:g}" for value in values])
         panel.axhline(0, color=_BASELINE, linewidth=1.3, linestyle="--")
         panel.set_title(named(metric), fontsize=10)
         panel.set_xlabel(for_line(key, _MAX_NAME))
@@ -325,14 +319,6 @@ def _dependence_line(axis: Axes, rows: pd.DataFrame, look: tuple[str, str]) -> L
         axis.plot(curve["value"], curve["change"], color=color, linewidth=0.7, alpha=0.45)
     mean = of["mean"]
     return axis.plot(mean["value"], mean["change"], color=color, marker=mark, linewidth=1.8)[0]
-
-
-def _scaled(axis: Axes, values: Sequence[float]) -> None:
-    """Mark the values of a setting on its axis, see `_LOG_FROM`."""
-    if values[0] > 0 and values[-1] >= _LOG_FROM * values[0]:
-        axis.set_xscale("log")
-        axis.xaxis.set_minor_locator(NullLocator())
-    axis.set_xticks(values, [f"{value:g}" for value in values])
 
 
 def _with_grid(axis: Axes) -> None:

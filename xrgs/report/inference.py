@@ -1,20 +1,19 @@
 """The statistics of a report: changes of pairs, intervals, tests, and corrections for many tests.
 
-All functions take and return float64 arrays [N], one element for each pair or mean. A number that
-can't be computed is NaN. Changes of pairs come with the reason why they can't be computed.
+All functions take and return float64 arrays [N], one element for each pair or mean. `base` and
+`value` are of the base and of the ablation, in the same unit. A mean is over `n` values, whose
+sample standard deviation `spread`, in the same unit, has n - 1 in the denominator. A number that
+can't be computed is NaN. Changes of pairs come with the reason why they can't be computed, else
+empty.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import bdtr, stdtr, stdtrit
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Floats = NDArray[np.float64]
+Floats = NDArray[np.float64]
 
 CONFIDENCE = 0.95
 #: The fewest values behind a mean with a verdict or a test; our choice. Two values show too little
@@ -37,15 +36,7 @@ WRONG_GAP = f"{ALL_HR} is worse"
 
 
 def difference(base: Floats, value: Floats) -> tuple[Floats, NDArray[np.str_]]:
-    """Return value - base, the change of a metric in dB.
-
-    Args:
-        base: [N] values of the base.
-        value: [N] values of the ablation, in the same unit.
-
-    Returns:
-        The differences [N], and the reasons [N] where there is none, else empty.
-    """
+    """Return value - base, the change of a metric in dB."""
     with np.errstate(all="ignore"):
         change = value - base
     why = np.select(
@@ -60,15 +51,7 @@ def log_ratio(base: Floats, value: Floats) -> tuple[Floats, NDArray[np.str_]]:
     """Return log(value / base), the change of a number that is above zero.
 
     Halving and doubling are then changes of the same size with a mean of 0, and an interval never
-    reaches below -100 %.
-
-    Args:
-        base: [N] values of the base.
-        value: [N] values of the ablation, in the same unit.
-
-    Returns:
-        The logarithms [N], and the reasons [N] where there is none, else empty. Equal finite values
-        give 0, whatever their sign.
+    reaches below -100 %. Equal finite values give 0, whatever their sign.
 
     Examples:
         >>> log_ratio(np.array([2.0, 2.0]), np.array([2.0, 0.0]))[0]
@@ -92,17 +75,10 @@ def log_ratio(base: Floats, value: Floats) -> tuple[Floats, NDArray[np.str_]]:
 def share_of_gap(
     base: Floats, value: Floats, all_hr: Floats, *, higher_is_better: bool
 ) -> tuple[Floats, NDArray[np.str_]]:
-    """Return the share of the gap between the base and all_hr that is closed, in percent.
+    """Return the share of the gap between the base and all_hr that is closed, %.
 
-    Args:
-        base: [N] values of the base.
-        value: [N] values of the ablation, in the same unit.
-        all_hr: [N] values of all_hr, in the same unit; NaN if there is none.
-        higher_is_better: The direction of the metric.
-
-    Returns:
-        The shares [N], %, and the reasons [N] where there is none, else empty. A share is negative
-        if the ablation is worse than the base, and above 100 if it is better than all_hr.
+    `all_hr` is NaN if there is none. A share is negative if the ablation is worse than the base,
+    and above 100 if it is better than all_hr.
 
     Examples:
         >>> args = np.array([20.0]), np.array([23.0]), np.array([24.0])
@@ -127,15 +103,7 @@ def share_of_gap(
 
 
 def half_width(spread: Floats, n: Floats) -> Floats:
-    """Return half the width of Student's 95 % interval of each mean.
-
-    Args:
-        spread: [N] sample standard deviations, with n - 1 in the denominator.
-        n: [N] number of values behind each mean.
-
-    Returns:
-        [N] in the unit of `spread`; NaN for fewer than two values.
-    """
+    """Return half the width of Student's 95 % interval of each mean; NaN for one value."""
     with np.errstate(all="ignore"):
         return np.asarray(stdtrit(n - 1, 0.5 + CONFIDENCE / 2) * spread / np.sqrt(n))
 
@@ -143,14 +111,8 @@ def half_width(spread: Floats, n: Floats) -> Floats:
 def prediction_half_width(spread: Floats, n: Floats) -> Floats:
     """Return half the width of the 95 % interval for one more value, around the mean of n values.
 
-    It is t s sqrt(1 + 1 / n), of n - 1 degrees of freedom, for values of a normal distribution.
-
-    Args:
-        spread: [N] sample standard deviations, with n - 1 in the denominator.
-        n: [N] number of values behind each mean.
-
-    Returns:
-        [N] in the unit of `spread`; NaN for fewer than `MIN_VALUES`.
+    It is t s sqrt(1 + 1 / n), of n - 1 degrees of freedom, for values of a normal distribution; NaN
+    for fewer than `MIN_VALUES`.
     """
     return np.where(n >= MIN_VALUES, half_width(spread, n) * np.sqrt(n + 1), np.nan)
 
@@ -158,15 +120,8 @@ def prediction_half_width(spread: Floats, n: Floats) -> Floats:
 def p_values(mean: Floats, spread: Floats, n: Floats) -> Floats:
     """Return the p of Student's two-sided test of each mean; null hypothesis: the true mean is 0.
 
-    It is below 0.05 if and only if the 95 % interval does not contain 0.
-
-    Args:
-        mean: [N] means.
-        spread: [N] sample standard deviations, with n - 1 in the denominator, in the same unit.
-        n: [N] number of values behind each mean.
-
-    Returns:
-        [N]; NaN for fewer than `MIN_VALUES`, or if all values are 0.
+    It is below 0.05 if and only if the 95 % interval does not contain 0. It is NaN for fewer than
+    `MIN_VALUES`, or if all values are 0.
     """
     with np.errstate(all="ignore"):
         p = 2 * stdtr(n - 1, -np.abs(mean) / spread * np.sqrt(n))
@@ -176,12 +131,8 @@ def p_values(mean: Floats, spread: Floats, n: Floats) -> Floats:
 def sign_test(up: Floats, down: Floats) -> Floats:
     """Return the p of the exact two-sided sign test; null hypothesis: the signs are equally likely.
 
-    Args:
-        up: [N] numbers of values above 0.
-        down: [N] numbers of values below 0. Values of 0 are left out, as is usual.
-
-    Returns:
-        [N]; 1 if there is no value.
+    `up` and `down` count values above and below 0. Values of 0 are left out, as is usual. Without
+    any value it is 1.
     """
     n = (up + down).astype(np.int64)
     return np.asarray(np.minimum(1.0, 2 * bdtr(np.minimum(up, down), n, 0.5)))
@@ -190,16 +141,9 @@ def sign_test(up: Floats, down: Floats) -> Floats:
 def equivalence(mean: Floats, spread: Floats, n: Floats, margin: Floats) -> Floats:
     """Return the p of two one-sided t-tests (TOST); null hypothesis: the mean is not in the margin.
 
-    It is at most 0.05 if and only if the 90 % interval of the mean is within the margin.
-
-    Args:
-        mean: [N] means.
-        spread: [N] sample standard deviations, with n - 1 in the denominator, in the same unit.
-        n: [N] number of values behind each mean.
-        margin: [N] the largest change that does not matter, in the same unit, at least 0.
-
-    Returns:
-        [N], NaN for fewer than `MIN_VALUES`. If all values are equal, 0 within the margin, else 1.
+    It is at most 0.05 if and only if the 90 % interval of the mean is within the margin, the
+    largest change that does not matter. It is NaN for fewer than `MIN_VALUES`. If all values are
+    equal, it is 0 within the margin, else 1.
 
     Source: [schuirmann1987].
     """
@@ -210,17 +154,11 @@ def equivalence(mean: Floats, spread: Floats, n: Floats, margin: Floats) -> Floa
 
 
 def holm(p: Floats) -> Floats:
-    """Return Holm's corrected p of each test.
+    """Return Holm's corrected p of each test; NaN where there is none, which does not count.
 
     The chance that any true null hypothesis has a corrected p of at most 0.05 is at most 5 %,
     however the tests depend on one another. Of the m tests sorted by p, the i-th has the maximum of
     (m - j + 1) p_j over j <= i.
-
-    Args:
-        p: [N] values of p; NaN where there is no test, which does not count among the m.
-
-    Returns:
-        [N], NaN where p is.
 
     Source: [holm1979].
 
@@ -240,15 +178,9 @@ def false_discovery_rates(p: Floats) -> Floats:
     """Return q of each test: the least false discovery rate at which it counts as a discovery.
 
     Of the m tests sorted by p, q of the i-th is the minimum of p_j m / j over j >= i. It holds for
-    tests that are independent or positively dependent.
+    tests that are independent or positively dependent. NaN is no test.
 
     Source: [benjamini1995].
-
-    Args:
-        p: [N] values of p; NaN where there is no test, which does not count among the m.
-
-    Returns:
-        [N], NaN where p is.
 
     Examples:
         >>> false_discovery_rates(np.array([0.02, 0.9, np.nan, 0.01]))

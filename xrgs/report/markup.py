@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
-from xrgs.runtime.text import one_line, padded
+from xrgs.runtime.text import TextTable, one_line, padded
 from xrgs.safeio.sanitize import MAX_CELL, for_file_name, for_latex, for_line, for_markdown
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from xrgs.runtime.text import TextTable
 
 #: Shrinks a table that is wider than the text.
 _LATEX_FITTED = r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%"

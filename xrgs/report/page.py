@@ -3,23 +3,32 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import pandas as pd
 
 from xrgs.evaluation.metrics import METRICS
 from xrgs.mixture.paths import TO_TRY
 from xrgs.report import curves, work
-from xrgs.report.collect import CELL_KEYS, RECORD_KEYS, ReportError, Sweep, read_cells
-from xrgs.report.compare import Design, compare
-from xrgs.report.context import contexts, decided_by_one_view
-from xrgs.report.external import with_external
+from xrgs.report.collect import (
+    CELL_KEYS,
+    RECORD_KEYS,
+    Choice,
+    ReportError,
+    ReportStore,
+    Sweep,
+    read_cells,
+    report_name,
+)
+from xrgs.report.compare import Comparison, Design, compare
+from xrgs.report.context import contexts, decided_by_one_view, photographs, with_variants
+from xrgs.report.external import External, with_external
 from xrgs.report.html import write_document
-from xrgs.report.joined import Choice, ReportStore, report_name
 from xrgs.report.markup import latex_file, to_markdown
 from xrgs.report.paper import paper_tables, texture_tables, why_no_table, with_texture
-from xrgs.report.photographs import photographs, with_variants
 from xrgs.report.pictures import Picture, draw
 from xrgs.report.tables import Tables
 from xrgs.report.writing import legend
@@ -30,14 +39,8 @@ from xrgs.store.provenance import MACHINE_KEYS, without_threads
 from xrgs.store.scoring import PROTOCOL
 from xrgs.store.store import BASELINE
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    import pandas as pd
-
-    from xrgs.report.compare import Comparison
-    from xrgs.report.external import External
-
+#: The page of a report.
+PAGE = "report.html"
 #: Up to this many ablations are printed with tables of their own; the files have all.
 _MAX_PRINTED_ABLATIONS = 6
 _MAX_PRINTED_MISSING = 20
@@ -65,40 +68,6 @@ class Report:
     """Every file that was written, sorted."""
 
 
-@dataclass(frozen=True)
-class Runs:
-    """Tables of trainings: `work.totals`, `curves.joined`, `curves.times`, `work.skipped`."""
-
-    labels: dict[str, list[str]]
-    """The labels of each condition's cells, in the sweep's order."""
-    totals: pd.DataFrame
-    curves: pd.DataFrame
-    times: pd.DataFrame
-    skipped: pd.DataFrame
-
-    @classmethod
-    def gather(cls, sweep: Sweep, cells: pd.DataFrame) -> Runs:
-        """Gather the tables of a sweep's compared cells."""
-        cells = cells[~cells["cell_id"].isin(sweep.renders)]  # nothing is known of other programs
-        labels = cells.groupby("condition", sort=False)["label"].unique()
-        return cls(
-            {str(name): list(group) for name, group in labels.items()},
-            work.totals(cells, sweep.done),
-            curves.joined(cells, sweep.done),
-            curves.times(cells, sweep.done),
-            work.skipped(cells, sweep.done),
-        )
-
-    def tables(self, base: str) -> list[TextTable]:
-        """Return the tables of each condition, time to quality first."""
-        kinds = (
-            (partial(curves.table, base=base), self.times),
-            (partial(work.skipped_table, base=base), self.skipped),
-            (work.totals_table, self.totals),
-        )
-        return [make(frame, of, name) for make, frame in kinds for name, of in self.labels.items()]
-
-
 def build(
     store_path: Path,
     sweep_ids: str | Sequence[str] | None = None,
@@ -111,22 +80,9 @@ def build(
 ) -> Report:
     """Write the tables, scores and figures of a sweep, or of several that are joined.
 
-    Args:
-        store_path: The store's folder.
-        sweep_ids: The id of the sweep, or the ids of those to join; None takes the latest one.
-        out: The folder to write to; None takes `reports/<sweep ids>` in the store, with
-            `.scenes-<names>` and `.ablations-<names>` added for a choice, and `.against-<label>`
-            for another base than the baseline.
-        pictures: Names of the pictures to draw, see `xrgs.report.pictures.draw`; None draws all.
-        against: The label that all others are compared with. If no cell is a baseline
-            (`baseline=false`), the first label replaces the baseline.
-        choice: The scenes and ablations of the report.
-        externals: Renders of other programs; each becomes one more label. The default folder's name
-            then ends with `.with-<label>` for each.
-        design: Outcomes, headline labels and margins of the tests; None takes the defaults.
-
-    Returns:
-        The report: its text and its files.
+    The arguments are those of `xrgs-report`, whose help explains them; without `sweep_ids` the
+    latest sweep is taken. `pictures` are names for `xrgs.report.pictures.draw`; None draws all.
+    `design` has outcomes, headline labels and margins of the tests; None takes the defaults.
 
     Raises:
         StoreError: The store has no such sweep.
@@ -152,16 +108,15 @@ def build(
     name = f"{report_name(ids)}{choice.suffix}{against_base}{others}"
     folder = out if out else store.reports / name
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        drawn = page.write(folder, store, pictures)
+        (folder / "figures").mkdir(parents=True, exist_ok=True)
+        files = page.write(folder, store, pictures)
     except OSError as error:
         raise ReportError(
             f"the report can't be written to {folder}: {error.filename}: {error.strerror};"
             " name another folder with --out"
         ) from error
-    written = {p.file for p in drawn if p.file} | {folder / name for name in _FILES}
     text = f"{page.text()}\n{for_line(f'Page: {folder / PAGE}')}"
-    return Report(text=text, folder=folder, files=tuple(sorted(written)))
+    return Report(text=text, folder=folder, files=tuple(sorted(files)))
 
 
 class _Page:
@@ -183,31 +138,43 @@ class _Page:
             if len(comparison.scenes) > 1:
                 self._ablations.append(tables.per_scene(*group))
 
-    def write(
-        self, folder: Path, store: ReportStore, pictures: Sequence[str] | None
-    ) -> list[Picture]:
-        """Write all files of a report; return its pictures."""
-        (folder / "figures").mkdir(exist_ok=True)
+    def write(self, folder: Path, store: ReportStore, pictures: Sequence[str] | None) -> list[Path]:
+        """Write all files of a report; return their paths."""
         sweep, tables, comparison = self._sweep, self._tables, self._tables.comparison
-        runs = Runs.gather(sweep, comparison.cells)
-        drawn = draw(store, comparison, sweep.views, runs.curves, folder / "figures", pictures)
-        _write_data(folder, sweep, comparison, runs)
-        changes = self._changes()
-        write_text(folder / "table.tex", latex_file([table for table in changes if table.rows]))
-        textures = texture_tables(comparison, sweep.views, tables.contexts)
-        everything = [*changes, *textures, *runs.tables(comparison.base), _provenance_table(sweep)]
+        base, cells = comparison.base, comparison.cells
+        cells = cells[~cells["cell_id"].isin(sweep.renders)]  # nothing is known of other programs
+        runs = {
+            "training": work.totals(cells, sweep.done),
+            "curves": curves.joined(cells, sweep.done),
+            "time_to_quality": curves.times(cells, sweep.done),
+            "skipped": work.skipped(cells, sweep.done),
+        }
+        drawn = draw(store, comparison, sweep.views, runs["curves"], folder / "figures", pictures)
+        changes, long = self._changes(), tables.long()
+        everything = [*changes, *texture_tables(comparison, sweep.views, tables.contexts)]
+        by_condition = cells.groupby("condition", sort=False)["label"].unique()
+        labels = {str(name): list(of) for name, of in by_condition.items()}
+        makers = (
+            partial(curves.table, runs["time_to_quality"], base=base),
+            partial(work.skipped_table, runs["skipped"], base=base),
+            partial(work.totals_table, runs["training"]),
+        )
+        everything += [make(of, name) for make in makers for name, of in labels.items()]
+        made = sweep.provenance
+        rows = tuple((key, "; ".join(made.get(key, ["n/a"]))) for key in _PROVENANCE_KEYS)
+        everything.append(TextTable("Made with", ("", "values"), rows, "ll"))
         everything = [table for table in everything if table.rows]
-        parts = [
-            f"# Change from {for_markdown(comparison.base)}\n",
-            *(_command_line(sweep_id, command) for sweep_id, command in sweep.commands.items()),
-            *(f"**{for_markdown(line)}**\n" for line in self._warnings),
-            *map(to_markdown, everything),
-            *_photographs(sweep),
-            *(_picture_link(picture, folder) for picture in drawn),
-        ]
-        write_text(folder / "table.md", "\n".join(parts))
-        long = tables.long()
-        write_text(folder / "table.csv", _csv(long))
+        files = [picture.file for picture in drawn if picture.file]
+        texts = {
+            "table.tex": latex_file([table for table in changes if table.rows]),
+            "table.md": self._markdown(everything, drawn, folder),
+        }
+        data = _data(sweep, comparison) | runs | {"table": long}
+        texts |= {f"{name}.csv": _csv(table) for name, table in data.items()}
+        for name, text in texts.items():
+            write_text(folder / name, text)
+        provenance = {for_line(key): [*map(for_line, of)] for key, of in made.items()}
+        write_json(folder / "provenance.json", provenance)
         write_document(
             folder / PAGE,
             store,
@@ -215,11 +182,11 @@ class _Page:
             tables,
             long,
             everything,
-            runs.curves,
+            runs["curves"],
             self._warnings,
             pictures=pictures is None or bool(pictures),
         )
-        return drawn
+        return [*files, *(folder / name for name in (*texts, "provenance.json", PAGE))]
 
     def _changes(self) -> list[TextTable]:
         """Return all tables of changes and values: missing cells first, then overviews."""
@@ -229,6 +196,26 @@ class _Page:
         result += [tables.values(name) for name in self._conditions]
         missing = tables.missing()
         return [missing, *result] if missing else result
+
+    def _markdown(
+        self, tables: Sequence[TextTable], pictures: Sequence[Picture], folder: Path
+    ) -> str:
+        lines = [f"# Change from {for_markdown(self._tables.comparison.base)}\n"]
+        for sweep_id, command in self._sweep.commands.items():
+            words = (for_markdown(shlex.quote(word)) for word in ("xrgs-sweep", *command))
+            lines.append(f"Sweep {for_markdown(sweep_id)}: {' '.join(words)}\n")
+        lines += [f"**{for_markdown(line)}**\n" for line in self._warnings]
+        lines += map(to_markdown, tables)
+        if by_scene := photographs(self._sweep):
+            notes = (f"{scene}: {note}" for scene, of in by_scene for note in of)
+            lines += ["## Photographs\n", *(f"- {for_markdown(note)}\n" for note in notes)]
+        for picture in pictures:
+            title, file = for_markdown(picture.title), picture.file
+            if file is None:
+                lines.append(f"No picture of {title}: {for_markdown(picture.why)}\n")
+            else:
+                lines.append(f"![{title}]({file.relative_to(folder)})\n\n{title}\n")
+        return "\n".join(lines)
 
     def text(self) -> str:
         """Return the text for a terminal, which has only some of the tables."""
@@ -249,71 +236,23 @@ class _Page:
         )
 
 
-#: The page of a report.
-PAGE = "report.html"
-#: The files of every report, beside its pictures.
-_FILES = (
-    PAGE,
-    "table.md",
-    "table.tex",
-    "table.csv",
-    "cells.csv",
-    "views.csv",
-    "training.csv",
-    "curves.csv",
-    "time_to_quality.csv",
-    "skipped.csv",
-    "provenance.json",
-)
-
-
-def _write_data(folder: Path, sweep: Sweep, comparison: Comparison, runs: Runs) -> None:
-    """Write the CSV tables and the provenance, for other programs."""
+def _data(sweep: Sweep, comparison: Comparison) -> dict[str, pd.DataFrame]:
+    """Return the tables of cells and views, for other programs."""
     cells = comparison.cells
-    names = cells.drop_duplicates("cell_id")[CELL_KEYS]
-    views = names.merge(sweep.views, on="cell_id")
     metrics = [metric.name for metric in comparison.metrics]
     counts = ["steps", "long_side", "factor"]
     order = [*RECORD_KEYS, "state", "reason", *counts, "protocol", "stale", "validation", "machine"]
     whole = cells[counts].astype("Int64").astype(object)  # without a decimal point, or missing
-    write_text(folder / "cells.csv", _csv(cells[[*order, *metrics]].assign(**whole)))
-    write_text(folder / "views.csv", _csv(views))
-    write_text(folder / "training.csv", _csv(runs.totals))
-    write_text(folder / "curves.csv", _csv(runs.curves))
-    write_text(folder / "time_to_quality.csv", _csv(runs.times))
-    write_text(folder / "skipped.csv", _csv(runs.skipped))
-    provenance = {for_line(key): [*map(for_line, of)] for key, of in sweep.provenance.items()}
-    write_json(folder / "provenance.json", provenance)
+    names = cells.drop_duplicates("cell_id")[CELL_KEYS]
+    return {
+        "cells": cells[[*order, *metrics]].assign(**whole),
+        "views": names.merge(sweep.views, on="cell_id"),
+    }
 
 
 def _csv(table: pd.DataFrame) -> str:
     safe = table.rename(columns=for_csv).map(for_csv)
     return str(safe.to_csv(index=False, lineterminator="\n"))
-
-
-def _command_line(sweep_id: str, command: Sequence[str]) -> str:
-    words = " ".join(for_markdown(shlex.quote(word)) for word in ("xrgs-sweep", *command))
-    return f"Sweep {for_markdown(sweep_id)}: {words}\n"
-
-
-def _photographs(sweep: Sweep) -> list[str]:
-    """Return a Markdown section with the notes on each scene's photographs."""
-    pairs = [(scene, note) for scene, notes in photographs(sweep) for note in notes]
-    lines = [f"- {for_markdown(f'{scene}: {note}')}\n" for scene, note in pairs]
-    return ["## Photographs\n", *lines] if lines else []
-
-
-def _picture_link(picture: Picture, folder: Path) -> str:
-    title = for_markdown(picture.title)
-    if picture.file is None:
-        return f"No picture of {title}: {for_markdown(picture.why)}\n"
-    return f"![{title}]({picture.file.relative_to(folder)})\n\n{title}\n"
-
-
-def _provenance_table(sweep: Sweep) -> TextTable:
-    provenance = sweep.provenance
-    rows = tuple((key, "; ".join(provenance.get(key, ["n/a"]))) for key in _PROVENANCE_KEYS)
-    return TextTable("Made with", ("", "values"), rows, "ll")
 
 
 def _warnings(sweep: Sweep) -> list[str]:

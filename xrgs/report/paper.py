@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from contextlib import suppress
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
+from xrgs.errors import StoreError
+from xrgs.evaluation.metrics import Metric
 from xrgs.report.averages import averaged
-from xrgs.report.compare import is_ratio
-from xrgs.report.context import context_of
+from xrgs.report.collect import ReportStore
+from xrgs.report.compare import Comparison, is_ratio
+from xrgs.report.context import Context
 from xrgs.report.inference import MIN_VALUES, log_ratio
 from xrgs.report.markup import filled, titled
 from xrgs.report.writing import (
+    Change,
     by_key,
     interval,
     lacking,
@@ -23,20 +28,11 @@ from xrgs.report.writing import (
     same_sign,
     signed,
 )
-from xrgs.runtime.progress import progress
+from xrgs.runtime.progress import ProgressBar
 from xrgs.runtime.text import TextTable, listed
 from xrgs.safeio.sanitize import counted
 from xrgs.store.store import BASELINE
-from xrgs.store.texture import texture_of
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-
-    from xrgs.evaluation.metrics import Metric
-    from xrgs.report.compare import Comparison
-    from xrgs.report.context import Context
-    from xrgs.report.joined import ReportStore
-    from xrgs.report.writing import Change
+from xrgs.store.trimming import home_of, textures
 
 #: Labels of the full XR-GS; each reads section 5.4 of the paper in another way.
 _READINGS = ("xrgs", "xrgs_per_class", "xrgs_own_threshold")
@@ -54,42 +50,25 @@ class _Column(NamedTuple):
     """Name of a metric -> its change, %."""
 
 
-_TABLE_1 = _Column(
-    "the paper's Table 1",
-    _LLFF,
-    {
-        "training_time_s": -44.57,
-        "gaussians": -69.68,
-        "memory_bytes": -46.50,
-        "lpips": 23.15,
-        "ssim": 0.45,
-        "psnr": -0.80,
-    },
-)
+#: The metrics of the paper's tables, in the order of the numbers below.
+_METRICS = ("training_time_s", "gaussians", "memory_bytes", "lpips", "ssim", "psnr")
+
+
+def _column(title: str, scenes: frozenset[str], *changes: float) -> _Column:
+    return _Column(title, scenes, dict(zip(_METRICS, changes, strict=True)))
+
+
+_TABLE_1 = _column("the paper's Table 1", _LLFF, -44.57, -69.68, -46.50, 23.15, 0.45, -0.80)
 _TABLE_2 = (
-    _Column(
+    _column(
         "the paper's Table 2, Dining Room",
         frozenset({"dining_room", "monstree"}),
-        {
-            "training_time_s": -24.87,
-            "gaussians": -70.99,
-            "memory_bytes": -33.08,
-            "lpips": -8.83,
-            "ssim": 3.60,
-            "psnr": 3.92,
-        },
+        *(-24.87, -70.99, -33.08, -8.83, 3.60, 3.92),
     ),
-    _Column(
+    _column(
         "the paper's Table 2, Keychain",
         frozenset({"keychain", "ollie"}),
-        {
-            "training_time_s": -16.32,
-            "gaussians": -66.05,
-            "memory_bytes": -2.59,
-            "lpips": 33.23,
-            "ssim": -1.56,
-            "psnr": -15.81,
-        },
+        *(-16.32, -66.05, -2.59, 33.23, -1.56, -15.81),
     ),
 )
 
@@ -119,18 +98,24 @@ def why_no_table(labels: Iterable[str], scenes: Iterable[str]) -> str:
 def paper_tables(comparison: Comparison, contexts: Mapping[str, Context]) -> list[TextTable]:
     """Return the paper's tables beside the changes of full XR-GS from the baseline.
 
-    Returns:
-        A table for each condition and each column of the paper whose scenes the comparison has;
-        empty if no label is full XR-GS, or the base is not the baseline.
+    There is a table for each condition and each column of the paper whose scenes the comparison
+    has; none if no label is full XR-GS, or the base is not the baseline.
     """
     labels = {label for label, _ in comparison.groups}
     if comparison.base != BASELINE or labels.isdisjoint(_READINGS):
         return []
-    names = [metric.name for metric in comparison.metrics]
-    per_scene, means = map(by_key, averaged(_as_ratios(comparison), names))
+    # log(value / base) is the effect of PSNR too: the paper has percent.
+    pairs, names = comparison.pairs, [metric.name for metric in comparison.metrics]
+    in_db = [metric.name for metric in comparison.metrics if not is_ratio(metric)]
+    rows = pairs["metric"].isin(in_db) & pairs["effect"].notna()
+    effect, why = log_ratio(*(pairs[name].to_numpy(np.float64) for name in ("base", "value")))
+    pairs = pairs.assign(
+        effect=np.where(rows, effect, pairs["effect"]), why=np.where(rows, why, pairs["why"])
+    )
+    per_scene, means = map(by_key, averaged(pairs, names))
     tables = []
     for condition in dict.fromkeys(condition for _, condition in comparison.groups):
-        context = context_of(contexts, condition).of_all
+        context = contexts.get(condition, Context()).of_all
         if _LLFF.issuperset(comparison.scenes):
             tables.append(_beside(comparison, condition, _TABLE_1, means, "", context))
         for column in _TABLE_2:
@@ -142,17 +127,6 @@ def paper_tables(comparison: Comparison, contexts: Mapping[str, Context]) -> lis
                 }
                 tables.append(_beside(comparison, condition, column, here, scene, context))
     return [table for table in tables if table.rows]
-
-
-def _as_ratios(comparison: Comparison) -> pd.DataFrame:
-    """Return the pairs with log(value / base) as the effect of PSNR too: the paper has percent."""
-    pairs = comparison.pairs
-    in_db = {metric.name for metric in comparison.metrics if not is_ratio(metric)}
-    rows = pairs["metric"].isin(in_db) & pairs["effect"].notna()
-    effect, why = log_ratio(*(pairs[name].to_numpy(np.float64) for name in ("base", "value")))
-    return pairs.assign(
-        effect=np.where(rows, effect, pairs["effect"]), why=np.where(rows, why, pairs["why"])
-    )
 
 
 def _beside(
@@ -221,20 +195,21 @@ _PHOTOGRAPH = ["variant_id", "split", "view"]
 
 
 def with_texture(store: ReportStore, cells: pd.DataFrame, views: pd.DataFrame) -> pd.DataFrame:
-    """Add the texture of each view's photograph to the scores of views.
+    """Add the `texture` of each view's photograph to the scores of views, in intensity per px.
 
-    Returns:
-        The views, with `texture` in intensity per px of the photograph. It is NaN where the
-        photograph can't be read, or was removed by a version that did not keep its texture.
+    It is NaN where the photograph can't be read, or was removed by a version that did not keep it.
     """
     scored = cells.drop_duplicates("cell_id").set_index("cell_id")[["variant_id", "validation"]]
     rows = views.join(scored, on="cell_id")
     rows["split"] = np.where(rows["validation"] > 0, "train", "test")
-    photographs = rows[_PHOTOGRAPH].drop_duplicates()
-    bar = progress(photographs.to_numpy(), "reading photographs", "photograph", len(photographs))
-    photographs["texture"] = [
-        texture_of(store.variant(variant_id), f"{split}/{view}") for variant_id, split, view in bar
-    ]
+    photographs = rows[_PHOTOGRAPH].drop_duplicates().assign(texture=np.nan)
+    names = photographs["split"] + "/" + photographs["view"]
+    with ProgressBar("reading photographs", "photograph", len(photographs)) as bar:
+        for variant_id, views_of in names.groupby(photographs["variant_id"], sort=False):
+            with suppress(StoreError):
+                known = textures(home_of(store.variants, str(variant_id)), [*views_of])
+                photographs.loc[views_of.index, "texture"] = views_of.map(known)
+            bar.update(len(views_of))
     found = rows.merge(photographs, on=_PHOTOGRAPH, how="left")["texture"]
     return views.assign(texture=found.to_numpy(np.float64))
 
@@ -244,9 +219,8 @@ def texture_tables(
 ) -> list[TextTable]:
     """Return tables of changes by texture, for conditions with at least three scenes.
 
-    Returns:
-        Tables with a row for each ablation and score: the change of each scene, the least textured
-        scene first, and Spearman's rank correlation of texture and change.
+    They have a row for each ablation and score: the change of each scene, the least textured scene
+    first, and Spearman's rank correlation of texture and change.
     """
     keys = comparison.cells.drop_duplicates("cell_id")[["cell_id", "condition", "scene"]]
     rows = views[["cell_id", "view", "texture"]].merge(keys, on="cell_id")
@@ -286,7 +260,7 @@ def _by_texture(
             "rank correlation: Spearman's, of texture and change over the scenes; it describes"
             " these scenes, and so few are no test",
         ),
-        context=context_of(contexts, condition).of_scores,
+        context=contexts.get(condition, Context()).of_scores,
     )
 
 
@@ -352,50 +326,34 @@ _FIGURES = (
 )
 
 
-@dataclass(frozen=True)
-class Counterpart:
-    """The view on the page that corresponds to a figure of the paper."""
-
-    name: str
-    shows: str
-    here: str
-    """The name of the view, or why there is none."""
-    section: str = ""
-    """The section of the page with the view, `views` or `training`; empty without a view."""
-    place: int = 0
-    """The index of the view in that section."""
-    label: str = ""
-    """The ablation to select there."""
-
-
 def counterparts(
-    labels: Iterable[str], views: Sequence[dict[str, Any]], training: Sequence[dict[str, Any]]
-) -> list[Counterpart]:
+    labels: Collection[str], views: Sequence[dict[str, Any]], training: Sequence[dict[str, Any]]
+) -> list[dict[str, Any]]:
     """Find the view on a report's page that corresponds to each figure of the paper.
 
-    The views are those of `xrgs.report.html.content.Content`.
+    The views are those of `xrgs.report.html.content.Content`. A view has its `section` of the page,
+    `views` or `training`, its `place` there, and the `label` to select. `here` is its name, or why
+    there is none.
     """
-    names = set(labels)
-    return [_counterpart(figure, training if figure.tag else views, names) for figure in _FIGURES]
-
-
-def _counterpart(
-    figure: _Figure, entries: Sequence[dict[str, Any]], labels: set[str]
-) -> Counterpart:
-    if figure.ablation not in labels:
-        why = f"this sweep has no cell of it: xrgs-sweep +ablation={figure.ablation} trains it"
-        return Counterpart(figure.name, figure.shows, why)
-    fitting = [
-        place
-        for place, entry in enumerate(entries)
-        if entry.get("tag", "") == figure.tag
-        and any(arm["label"] == figure.ablation and "image" in arm for arm in entry["arms"])
-    ]
-    if not fitting:
-        return Counterpart(figure.name, figure.shows, "the page has no picture of it, see below")
-    same_scene = [place for place in fitting if entries[place]["scene"] in figure.scenes]
-    place = (same_scene or fitting)[0]
-    shown = entries[place]
-    here = f"{shown['scene']}, view {shown['view']}, {figure.ablation}"
-    section = "training" if figure.tag else "views"
-    return Counterpart(figure.name, figure.shows, here, section, place, figure.ablation)
+    found = []
+    for figure in _FIGURES:
+        section, entries = ("training", training) if figure.tag else ("views", views)
+        fitting = [
+            place
+            for place, entry in enumerate(entries)
+            if entry.get("tag", "") == figure.tag
+            and any(arm["label"] == figure.ablation and "image" in arm for arm in entry["arms"])
+        ]
+        row: dict[str, Any] = {"name": figure.name, "shows": figure.shows, "section": ""}
+        if figure.ablation not in labels:
+            what = f"xrgs-sweep +ablation={figure.ablation} trains it"
+            row["here"] = f"this sweep has no cell of it: {what}"
+        elif not fitting:
+            row["here"] = "the page has no picture of it, see below"
+        else:
+            same_scene = [place for place in fitting if entries[place]["scene"] in figure.scenes]
+            place = (same_scene or fitting)[0]
+            here = f"{entries[place]['scene']}, view {entries[place]['view']}, {figure.ablation}"
+            row |= {"here": here, "section": section, "place": place, "label": figure.ablation}
+        found.append(row)
+    return found

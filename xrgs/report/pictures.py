@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from xrgs.errors import StoreError, UnreadableError
 from xrgs.photos import images
 from xrgs.photos.images import ImageError
-from xrgs.report.collect import ReportError
-from xrgs.report.compare import is_ratio, run_name
+from xrgs.report.collect import ReportError, ReportStore
+from xrgs.report.compare import Comparison, is_ratio, run_name
 from xrgs.report.curves import means_over_runs, means_over_scenes
 from xrgs.report.figures import (
     MAX_ARMS,
@@ -33,16 +35,7 @@ from xrgs.safeio.atomic import atomic_writer
 from xrgs.safeio.sanitize import for_file_name
 from xrgs.store.trimming import check_images
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from xrgs.report.compare import Comparison
-    from xrgs.report.joined import ReportStore
-
-    _Drawing = Callable[[Path], "Picture"]  # draws into the file
+_Drawing = Callable[[Path], "Picture"]  # draws into the file
 
 #: The scores in figures over training time.
 _QUALITY = ("psnr", "lpips")
@@ -82,18 +75,13 @@ def draw(
     folder: Path,
     names: Sequence[str] | None = None,
 ) -> list[Picture]:
-    """Draw the pictures of a report.
+    """Draw the pictures of a report, in the order of the tables.
 
     For each condition: the trade-offs of its ablations if there are several, and quality during
     training if it was evaluated. For each setting with at least three values: the changes over it.
-    For each scene and ablation: views and training curves of the first condition and replicate,
-    which the titles name. `names` are their files without suffix; None draws the first 40.
-
-    Returns:
-        The pictures, in the order of the tables.
-
-    Raises:
-        ReportError: There is no picture of such a name.
+    For each scene and ablation: views and training curves of the first condition and replicate.
+    `names` are their files without suffix; None draws the first 40. ReportError says that there is
+    no picture of such a name.
     """
     first = comparison.pairs.sort_values(["variant_seed", "seed"], kind="stable")
     pairs = first.drop_duplicates(["scene", "label"]).sort_values(["scene", "label"])
@@ -103,8 +91,11 @@ def draw(
     cells = comparison.cells.drop_duplicates("cell_id").set_index("cell_id")
     drawings = _curves_of_quality(comparison, quality)
     drawings |= _trade_offs(comparison) | _sensitivities(comparison)
+    none = pd.Series(dtype=float)
     for _, pair in pairs.iterrows():
-        both = _same_views(psnr.get(pair["base_id"]), psnr.get(pair["cell_id"]))
+        base, ablation = psnr.get(pair["base_id"], none), psnr.get(pair["cell_id"], none)
+        shared = ablation.index[ablation.index.isin(base.index)]
+        both = base[shared], ablation[shared]
         cell = cells.loc[pair["cell_id"]]
         split = "train" if cell["validation"] > 0 else "test"
         variant = store.variant(cell["variant_id"])
@@ -112,33 +103,20 @@ def draw(
         drawings[stem] = partial(_views, store, pair, comparison.base, both, variant, split)
         if not store.external.keys() & {pair["base_id"], pair["cell_id"]}:
             drawings[f"{stem}--training"] = partial(_training, store, pair, comparison.base)
-    first_ones = dict(islice(drawings.items(), _MAX_PICTURES))
-    chosen = first_ones if names is None else _chosen(drawings, names)
+    if unknown := [name for name in names or () if name not in drawings]:
+        choices = ", ".join(drawings) or "none"
+        raise ReportError(
+            f"pictures={unknown[0]}: there is no picture of that name; choose from: {choices}"
+        )
+    chosen = {name: drawing for name, drawing in drawings.items() if name in (names or ())}
+    if names is None:
+        chosen = dict(islice(drawings.items(), _MAX_PICTURES))
     bar = progress(chosen.items(), "drawing", "picture", len(chosen))
     drawn = [drawing(folder / f"{name}.png") for name, drawing in bar]
     if names is None and len(chosen) < len(drawings):
         why = f"only the first {len(chosen)} are drawn; --pictures NAMES draws others"
         drawn.append(Picture(f"{len(drawings) - len(chosen)} more", None, why))
     return drawn
-
-
-def _same_views(base: pd.Series | None, ablation: pd.Series | None) -> tuple[pd.Series, pd.Series]:
-    """Return the PSNR of both cells, dB, for the views that both have; empty if there is none."""
-    if base is None or ablation is None:
-        return pd.Series(dtype=float), pd.Series(dtype=float)
-    both = ablation.index[ablation.index.isin(base.index)]
-    return base[both], ablation[both]
-
-
-def _chosen(drawings: dict[str, _Drawing], names: Sequence[str]) -> dict[str, _Drawing]:
-    """Return the drawings of these names."""
-    for name in names:
-        if name not in drawings:
-            choices = ", ".join(drawings) or "none"
-            raise ReportError(
-                f"pictures={name}: there is no picture of that name; choose from: {choices}"
-            )
-    return {name: drawing for name, drawing in drawings.items() if name in names}
 
 
 def _trade_offs(comparison: Comparison) -> dict[str, _Drawing]:
@@ -183,16 +161,13 @@ def _sensitivities(comparison: Comparison) -> dict[str, _Drawing]:
 
 
 def sensitivities(comparison: Comparison) -> dict[str, pd.DataFrame]:
-    """Return how the changes depend on each numeric setting that was swept.
+    """Return how the changes depend on each numeric setting with at least three values, by its key.
 
     The values are read from labels, for a setting of the ablation (`consistency.weight=0.05`), and
-    from conditions, for a setting that the base has too (`variant.factor=2`).
-
-    Returns:
-        Key of a setting with at least three values -> one row for each change: `level` (`pair`,
-        `scene` or `mean`), `scene` (missing for a mean), `metric`, `change`, `value` (of the
-        setting), `ablation` (the label without the setting) and `series` (label and condition
-        without the setting; each series is a curve).
+    from conditions, for a setting that the base has too (`variant.factor=2`). A table has a row for
+    each change: `level` (`pair`, `scene` or `mean`), `scene` (missing for a mean), `metric`,
+    `change`, `value` (of the setting), `ablation` (the label without the setting) and `series`
+    (label and condition without the setting; each series is a curve).
     """
     changes = _changes(comparison)
     by_key = {}
@@ -220,11 +195,9 @@ def _changes(comparison: Comparison) -> pd.DataFrame:
 
 
 def _settings(groups: Iterable[tuple[str, str]]) -> dict[str, pd.DataFrame]:
-    """Read the numeric settings in labels and conditions.
+    """Return the `value`, `ablation` and `series` of `sensitivities` for each numeric setting.
 
-    Returns:
-        Key of a setting -> one row for each (label, condition) with the setting: `label`,
-        `condition`, and `value`, `ablation` and `series` of `sensitivities`.
+    There is a row for each label and condition with the setting.
     """
     by_key: dict[str, list[tuple[str, str, float, str, str]]] = {}
     for label, condition in groups:
@@ -309,12 +282,7 @@ def _not_drawn(title: str, why: str, _: Path) -> Picture:
 def median_view(base: pd.Series, ablation: pd.Series) -> str:
     """Return the view with the median change of PSNR: neither the best nor the worst case.
 
-    Args:
-        base: PSNR of the base in dB, indexed by view.
-        ablation: PSNR of the ablation in dB, indexed by view.
-
-    Returns:
-        The name of the view; for an even number of views, the lower of the two in the middle.
+    Both have the PSNR of each view, dB. Of an even number of views it is the lower in the middle.
     """
     change = (ablation - base.reindex(ablation.index)).fillna(0.0).sort_index()
     return str(change.sort_values(kind="stable").index[(len(change) - 1) // 2])

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 
-from xrgs.report.context import context_of
+from xrgs.evaluation.metrics import Metric
+from xrgs.report.compare import Comparison
+from xrgs.report.context import Context
 from xrgs.report.inference import ALL_HR
 from xrgs.report.markup import filled, titled
 from xrgs.report.writing import (
@@ -32,13 +34,6 @@ from xrgs.report.writing import (
     with_unit,
 )
 from xrgs.runtime.text import TextTable
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from xrgs.evaluation.metrics import Metric
-    from xrgs.report.compare import Comparison
-    from xrgs.report.context import Context
 
 #: Metrics that differ between two runs of the same training.
 _NOISY = frozenset({"training_time_s", "render_time_ms", "peak_rss_bytes"})
@@ -74,7 +69,7 @@ class Tables:
         return tuple(dict.fromkeys(text for one in self.contexts.values() for text in one.cautions))
 
     def _context(self, condition: str) -> Context:
-        return context_of(self.contexts, condition)
+        return self.contexts.get(condition, Context())
 
     @cached_property
     def _means(self) -> dict[tuple[str, ...], Change]:
@@ -133,9 +128,8 @@ class Tables:
     def unchanged(self, label: str, condition: str) -> str:
         """Say why an ablation has nothing to compare: its cells or results are those of the base.
 
-        Returns:
-            The end of a sentence that begins with the label; empty if something changed. Times and
-            the memory of the process don't count, since they differ in every run.
+        It is the end of a sentence that begins with the label, and empty if something changed.
+        Times and the memory of the process don't count, since they differ in every run.
         """
         pairs, base = self.comparison.pairs, self.comparison.base
         own_pairs = pairs[(pairs["label"] == label) & (pairs["condition"] == condition)]
@@ -163,6 +157,10 @@ class Tables:
             return TextTable(title, ("Result",), ((f"{label} {why}",),), "l")
         # A verdict that all rows share is said once, in the context.
         shared = NO_INTERVAL if all(math.isnan(row.low) for row, _ in changes) else ""
+        replicates = [
+            self._replicates[label, condition, s] for s in self.scenes_of(label, condition)
+        ]
+        is_mixed = scenes > 1 and all(len(of_scene) == 1 for of_scene in replicates)
         corrected = "p (Holm)" if label in self.comparison.design.headline else "q"
         table = TextTable(
             title=title,
@@ -179,7 +177,7 @@ class Tables:
                     for row, metric in changes
                     if row.why and not math.isnan(row.change)
                 ),
-                *self._mixed_note(label, condition),
+                *["one replicate a scene: differences of runs and of scenes are mixed"] * is_mixed,
             ),
             context="; ".join(filter(None, (shared, self._context(condition).of_all))),
             name=f"{label} {condition}".strip(),
@@ -195,14 +193,6 @@ class Tables:
         )  # fmt: skip
         names = f"{len(scenes)}{of} scenes" if len(scenes) != 1 or of else f"scene {scenes[0]}"
         return f"{names}, {_listed(replicates)}"
-
-    def _mixed_note(self, label: str, condition: str) -> tuple[str, ...]:
-        """Return a note for several scenes with one replicate each: intervals mix both scatters."""
-        scenes = self.scenes_of(label, condition)
-        counts = {len(self._replicates[label, condition, s]) for s in scenes}
-        if counts != {1} or len(scenes) < 2:
-            return ()
-        return ("one replicate a scene: differences of runs and of scenes are mixed",)
 
     def per_scene(self, label: str, condition: str) -> TextTable:
         """Return a table with a column for each scene, including failed ones, and their mean."""
@@ -263,7 +253,9 @@ class Tables:
         """
         cells = self.comparison.cells
         here = cells[cells["condition"] == condition]
-        labels, metrics = list(dict.fromkeys(here["label"])), self._scores()
+        labels = list(dict.fromkeys(here["label"]))
+        metrics = [metric for metric in self.comparison.metrics if metric.score is not None]
+        metrics.sort(key=lambda metric: _PAPER_ORDER.get(metric.name, len(_PAPER_ORDER)))
         done = here[here["state"] == "done"]
         names = [metric.name for metric in metrics]
         means = done.groupby(["label", "scene"])[names].mean().to_dict("index")
@@ -298,17 +290,11 @@ class Tables:
             best=frozenset(best),
         )  # fmt: skip
 
-    def _scores(self) -> list[Metric]:
-        """Return the metrics that score views, in the order of papers."""
-        scores = [metric for metric in self.comparison.metrics if metric.score is not None]
-        return sorted(scores, key=lambda metric: _PAPER_ORDER.get(metric.name, len(_PAPER_ORDER)))
-
     def gaps(self) -> list[TextTable]:
         """Return a table of shares of the gap for each condition with all_hr and another ablation.
 
-        It has a row for each ablation and score: the share of the gap in percent, scene by scene
-        and in the mean over scenes, with its interval and sign test. Notes say why a scene has no
-        share, or why pairs are left out of a mean.
+        It has the share of each ablation and score in percent, scene by scene and in the mean over
+        scenes. Notes say why a scene has no share, or why pairs are left out of a mean.
         """
         means, per_scene = by_key(self.comparison.gaps), by_key(self.comparison.gaps_per_scene)
         conditions = dict.fromkeys(condition for _, condition, _ in means)
@@ -384,7 +370,12 @@ class Tables:
         means = self.comparison.means.reset_index()
         scenes = scenes.assign(level="scene", outcome=False)  # verdicts are of means
         table = pd.concat([means.assign(level="mean", scene=""), scenes])
-        table = table.merge(self._long_gaps(), how="left", on=_LEVEL)
+        gaps = [
+            self.comparison.gaps.reset_index().assign(level="mean", scene=""),
+            self.comparison.gaps_per_scene.reset_index().assign(level="scene"),
+        ]
+        shares = pd.concat(gaps)[[*_LEVEL, *_GAP]].rename(columns=_GAP)
+        table = table.merge(shares, how="left", on=_LEVEL)
         rows = [*by_key(table).values()]
         of = [metrics[name] for name in table["metric"]]
         table["printed"] = [pointed(r.change, m).rstrip() for r, m in zip(rows, of, strict=True)]
@@ -402,12 +393,6 @@ class Tables:
              "scatter_replicates", "scatter_scenes", "p", "q", "p_holm", "p_equivalent",
              "printed", "verdict", "why", *_GAP.values()]
         ]  # fmt: skip
-
-    def _long_gaps(self) -> pd.DataFrame:
-        """Return the shares of the gap to all_hr, with the keys of `long`."""
-        scenes = self.comparison.gaps_per_scene.reset_index().assign(level="scene")
-        means = self.comparison.gaps.reset_index().assign(level="mean", scene="")
-        return pd.concat([means, scenes])[[*_LEVEL, *_GAP]].rename(columns=_GAP)
 
 
 def _score(value: float, metric: Metric) -> str:

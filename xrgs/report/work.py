@@ -8,18 +8,14 @@ from its summary. The cost of skipped work is estimated from the same run's tota
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 import pandas as pd
 
-from xrgs.report.collect import CELL_KEYS, is_component_log
+from xrgs.report.collect import CELL_KEYS, DoneCell, is_component_log
 from xrgs.report.markup import titled
 from xrgs.runtime.text import TextTable
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-
-    from xrgs.report.collect import DoneCell
 
 _LABELS = {
     "steps_HR": "Steps on HR views",
@@ -94,10 +90,9 @@ _KINDS = {
 def totals(cells: pd.DataFrame, done: Mapping[str, DoneCell]) -> pd.DataFrame:
     """Return the counts of training in each of `Comparison.cells` that is done.
 
-    Returns:
-        One row for each cell: `CELL_KEYS`, and a column for each count of its history (at the end
-        of training) and each value that a component logged (its mean over training); NaN for a cell
-        without it.
+    There is a row for each cell: `CELL_KEYS`, and a column for each count of its history (at the
+    end of training) and each value that a component logged (its mean over training); NaN for a cell
+    without it.
     """
     keys = cells.loc[cells["cell_id"].isin(done), CELL_KEYS].drop_duplicates("cell_id")
     keys = keys.reset_index(drop=True)
@@ -107,7 +102,10 @@ def totals(cells: pd.DataFrame, done: Mapping[str, DoneCell]) -> pd.DataFrame:
 def totals_table(totals: pd.DataFrame, labels: Sequence[str], condition: str) -> TextTable:
     """Return the table of `totals` of one condition, scene by scene, as means over seeds."""
     chosen = totals[totals["condition"] == condition]
-    names = [name for name in _ordered(totals) if chosen[name].notna().any()]
+    numbers = [
+        name for name in totals.columns if name not in CELL_KEYS and chosen[name].notna().any()
+    ]
+    names = sorted(numbers, key=lambda name: (name not in _LABELS, is_component_log(name)))
     means = chosen.groupby(["scene", "label"])[names].mean().to_dict("index")
     rows = []
     for scene in sorted(chosen["scene"].unique()):
@@ -128,12 +126,6 @@ def totals_table(totals: pd.DataFrame, labels: Sequence[str], condition: str) ->
     )
 
 
-def _ordered(totals: pd.DataFrame) -> list[str]:
-    """Return the columns of numbers: those of `_LABELS`, others, then the components'."""
-    numbers = [name for name in totals.columns if name not in CELL_KEYS]
-    return sorted(numbers, key=lambda name: (name not in _LABELS, is_component_log(name)))
-
-
 def _count(value: float | None, *, is_component_log: bool) -> str:
     if value is None or pd.isna(value):
         return ""
@@ -141,10 +133,7 @@ def _count(value: float | None, *, is_component_log: bool) -> str:
 
 
 def _work(cell: DoneCell) -> dict[str, float]:
-    """Return the totals of a cell: of its summary, and counts of steps that skipped something.
-
-    Cells of older versions have no `work` and no seconds of stages.
-    """
+    """Return the totals of a cell; older versions kept no `work` and no seconds of stages."""
     summary = cell.summary
     return {
         **summary.work,
@@ -159,11 +148,10 @@ def _work(cell: DoneCell) -> dict[str, float]:
 def skipped(cells: pd.DataFrame, done: Mapping[str, DoneCell]) -> pd.DataFrame:
     """Return the work that each of `Comparison.cells` skipped.
 
-    Returns:
-        One row for each cell and kind of work with known counts: `CELL_KEYS` and `kind`; the
-        skipped `number`, and its `share` of the total; the estimated `cost` of the skipped work in
-        the kind's `unit` (`s` or `evaluations`), and `cost_share`, the cost over that of the whole
-        run. The costs are NaN if unknown.
+    There is a row for each cell and kind of work with known counts: `CELL_KEYS` and `kind`; the
+    skipped `number`, and its `share` of the total; the estimated `cost` of the skipped work in the
+    kind's `unit` (`s` or `evaluations`), and `cost_share`, the cost over that of the whole run. The
+    costs are NaN if unknown.
     """
     rows = []
     finished = cells[cells["cell_id"].isin(done)].drop_duplicates(CELL_KEYS)

@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import math
 import re
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
-from xrgs.report.compare import is_ratio
+import pandas as pd
+
+from xrgs.evaluation.metrics import Metric
+from xrgs.report.compare import Comparison, is_ratio
 from xrgs.report.inference import LEVEL, MIN_VALUES
 from xrgs.runtime.text import TextTable
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    import pandas as pd
-
-    from xrgs.evaluation.metrics import Metric
-    from xrgs.report.compare import Comparison
 
 #: Arrows mean improvement and degradation, as in the paper's tables: fewer Gaussians are `↑`.
 BETTER, WORSE, SAME = "↑", "↓", "="
@@ -100,11 +96,7 @@ def signed(value: float) -> str:
 
 
 def arrow(change: float, metric: Metric) -> str:
-    """Return the arrow of a change: whether it is an improvement of the metric.
-
-    Returns:
-        `BETTER`, `WORSE`, `SAME` if the change is printed as 0.00, or a space for NaN.
-    """
+    """Return `BETTER`, `WORSE`, `SAME` for a change that is printed as 0.00, or a space for NaN."""
     if math.isnan(change):
         return " "
     if signed(change) == "0.00":
@@ -136,10 +128,9 @@ def with_unit(change: float, metric: Metric) -> str:
 def verdict(row: Change, metric: Metric) -> str:
     """Return the verdict of a change's tests, in words.
 
-    Returns:
-        `equivalent` if the change is within its margin (TOST), else `better` or `worse` if the
-        corrected p is at most 0.05, else `not shown`. `descriptive` for a metric that is no
-        outcome, `one replicate: no interval`, or `n/a` with the reason.
+    It is `equivalent` if the change is within its margin (TOST), else `better` or `worse` if the
+    corrected p is at most 0.05, else `not shown`. It is `descriptive` for a metric that is no
+    outcome, `one replicate: no interval`, or `n/a` with the reason.
     """
     if math.isnan(row.change):
         return f"n/a: {row.why}"
@@ -157,9 +148,8 @@ def verdict(row: Change, metric: Metric) -> str:
 def marked(row: Change | None, metric: Metric, scenes: int) -> str:
     """Write a mean over `scenes` scenes with its marks: `-44.57 ↑ * (3 of 4)`.
 
-    Returns:
-        The change, `*` if it is shown to be better or worse, `≈` if it is equivalent, and the
-        number of scenes in the mean if some are lacking.
+    `*` says that it is shown to be better or worse, `≈` that it is equivalent, and the number of
+    scenes that some are lacking.
     """
     if row is None:
         return MISSING
@@ -187,8 +177,7 @@ def interval(low: float, high: float) -> str:
 def same_sign(row: Change) -> str:
     """Write how many values have the sign of their mean, and the p of the sign test.
 
-    Returns:
-        `4 of 4 (0.125)`; empty for fewer than two values.
+    It is `4 of 4 (0.125)`, and empty for fewer than two values.
     """
     return f"{row.agree} of {row.n} ({p_value(row.p_sign)})" if row.n > 1 else ""
 

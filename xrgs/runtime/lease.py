@@ -26,19 +26,16 @@ import secrets
 import socket
 import threading
 import time
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from enum import Enum
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import msgspec
 
-from xrgs.runtime import processes
+from xrgs.runtime import machine
 from xrgs.safeio.files import read_bytes
 from xrgs.safeio.sanitize import for_line
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
 
 _log = logging.getLogger(__name__)
 
@@ -74,12 +71,12 @@ class Owner(msgspec.Struct, frozen=True):
     @property
     def lives(self) -> bool:
         """Whether the process exists, suspended or not; only valid if it is `here`."""
-        return processes.lives(self.pid, self.started)
+        return machine.lives(self.pid, self.started)
 
     @property
     def here(self) -> bool:
         """Whether the process belongs to this machine, its present boot and process namespace."""
-        return (self.host, self.boot) == (socket.gethostname(), processes.boot())
+        return (self.host, self.boot) == (socket.gethostname(), machine.boot())
 
     def __str__(self) -> str:
         return f"process {self.pid} on {for_line(self.host)}"
@@ -191,7 +188,7 @@ def sign(path: Path) -> Owner:
     FileExistsError if it exists.
     """
     pid = os.getpid()  # not cached: a process may be forked
-    owner = Owner(socket.gethostname(), processes.boot(), pid, processes.started(pid))
+    owner = Owner(socket.gethostname(), machine.boot(), pid, machine.started(pid))
     with path.open("xb") as stream:
         try:
             stream.write(json.dumps(msgspec.structs.asdict(owner)).encode())

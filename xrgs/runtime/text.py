@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import unicodedata
+from collections.abc import Sequence
 from dataclasses import dataclass
 from textwrap import wrap
-from typing import TYPE_CHECKING
 
 from xrgs.safeio.sanitize import MAX_CELL, for_line
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 #: The longest line of a table of sentences on a terminal, in columns.
 _MAX_WIDTH = 100

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import itertools
-from typing import TYPE_CHECKING
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from pathlib import Path
 
 from xrgs.errors import StoreError, UnreadableError
 from xrgs.safeio.files import is_transient, walk_files
 from xrgs.safeio.hashing import file_digest
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator, Mapping
-    from pathlib import Path
 
 
 def hashes(folder: Path, names: Iterable[str]) -> dict[str, str]:

@@ -11,11 +11,8 @@ import os
 import re
 import shutil
 import stat
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 #: The largest file that is read whole, in bytes. A sweep's record of ten thousand cells has 3 MB.
 MAX_BYTES = 1 << 26

@@ -10,19 +10,16 @@ import io
 import os
 import re
 from collections import deque
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
-from typing import TYPE_CHECKING, Any, BinaryIO
+from pathlib import Path
+from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from xrgs.errors import XrgsError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
 MAX_HEADER_BYTES = 1 << 20
 #: Vertices whose properties are taken one after the other. They fit in a cache, which is eight

@@ -6,18 +6,16 @@ import csv
 import io
 import math
 import re
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import islice
-from typing import TYPE_CHECKING, TypeVar
+from pathlib import Path
+from typing import TypeVar
 
 import msgspec
 
 from xrgs.errors import StoreError, UnreadableError
 from xrgs.safeio.files import is_transient, list_names, read_bytes
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-    from pathlib import Path
 
 _T = TypeVar("_T")
 

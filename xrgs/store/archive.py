@@ -1,12 +1,10 @@
 """Packs results of a store for other people, and imports their stores.
 
-`pack` writes done cells, their variants and the records of their sweeps into one archive, which is
-a store when it is unpacked. The archive has the files that reports are made from and that sweeps
-continue from. It has no logs, and no full paths: those in configs and commands become relative.
+A pack is a store when it is unpacked, with the files that reports are made from and that sweeps
+continue from. It has no logs, and no full paths.
 
-`import_store` copies a store of somebody else, an archive or a folder, into one's own. Archives are
-unpacked by tarfile's filter `data`. JSON and CSV files are decoded by their types, and all files
-are verified by their hashes. An item that fails a check is left out and named.
+An import unpacks archives by tarfile's filter `data`. JSON and CSV files are decoded by their
+types, and all files are verified by their hashes. An item that fails a check is left out and named.
 """
 
 from __future__ import annotations
@@ -18,10 +16,11 @@ import re
 import shutil
 import stat
 import tarfile
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import PurePath
-from typing import TYPE_CHECKING, Any
+from pathlib import Path, PurePath
+from typing import Any
 
 import msgspec
 
@@ -35,17 +34,11 @@ from xrgs.safeio.atomic import atomic_writer, json_text
 from xrgs.safeio.files import is_inside, is_name, remove_path, sync_name, sync_tree, walk_files
 from xrgs.safeio.records import errors_named, read_file, read_struct, read_table
 from xrgs.safeio.sanitize import counted, for_line
-from xrgs.store import texture, trimming
+from xrgs.store import trimming
 from xrgs.store.cell_folder import CONFIG, NOT_RESULTS, STATUS, CellFolder, CellState
 from xrgs.store.identity import cell_id
 from xrgs.store.schema import FileEntry
-from xrgs.store.store import unchanged_record
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
-    from pathlib import Path
-
-    from xrgs.store.store import Store
+from xrgs.store.store import Store, unchanged_record
 
 #: The folder in the archive; the default of `store=`, so that commands find it once it is unpacked.
 _ROOT = "xrgs-store"
@@ -59,36 +52,34 @@ _Files = dict[str, tuple[bytes, float]]
 
 
 @dataclass(frozen=True)
-class Packed:
-    """How much was packed, and which items were left out."""
+class Copied:
+    """How much was packed or imported, and which items were left out."""
 
     cells: int
     variants: int
+    scenes: int
     sweeps: int
-    bytes: int
-    """The size of the archive."""
     left_out: tuple[str, ...]
-    """A line for each cell, variant and record that is damaged or can't be read now."""
+    """Lines on items that are damaged or can't be read now, with the reasons and names."""
+    bytes: int = 0
+    """The size of the packed archive."""
+    present: int = 0
+    """How many imported items the store had already: they did not change."""
 
     def __str__(self) -> str:
-        return _counts(self.cells, self.variants, self.sweeps)
+        scenes = [counted(self.scenes, "rendered scene")] if self.scenes else []
+        parts = [counted(self.cells, "cell"), counted(self.variants, "variant"), *scenes]
+        return ", ".join([*parts, f"{counted(self.sweeps, 'record')} of sweeps"])
 
 
 def pack(
     store: Store, cells: Sequence[CellFolder], out: Path, here: Path, sweeps: Sequence[str] = ()
-) -> Packed:
-    """Write an archive of done cells; the store does not change.
+) -> Copied:
+    """Write an archive (`.tar.xz`, replaced) of cells that are all done; the store does not change.
 
-    Args:
-        store: The store.
-        cells: The cells to pack, all of them done.
-        out: The archive to write or replace, `.tar.xz`; its folder must exist.
-        here: The folder below which full paths in configs and commands are made relative; of a path
-            elsewhere only the last name is kept.
-        sweeps: Ids of the sweeps whose records are packed; empty for all that have such a cell.
-
-    Raises:
-        StoreError: `out` can't be written, or the store can't be read.
+    Full paths in configs and commands are made relative to `here`; of a path elsewhere only the
+    last name is kept. `sweeps` are ids of the sweeps whose records are packed; empty for all that
+    have such a cell. StoreError says that `out` can't be written, or the store not be read.
     """
     left_out: list[str] = []
 
@@ -107,7 +98,7 @@ def pack(
     with errors_named(out):
         size = _write(out, [*done.values(), *variants, *records])
     counts = [len(items) - items.count({}) for items in (variants, records)]
-    return Packed(len(done), counts[0], counts[1], size, tuple(left_out))
+    return Copied(len(done), counts[0], 0, counts[1], tuple(left_out), bytes=size)
 
 
 def _write(out: Path, groups: Iterable[_Files]) -> int:
@@ -146,14 +137,13 @@ def _verified(folder: Path, name: str, sha256: str) -> bytes:
 def _variant(store: Store, variant_id: str) -> _Files:
     """Return the files of a variant as if it were trimmed, under a trimmed variant's name."""
     trimmed = paths.trimmed_folder(store.variants, variant_id)
-    folder = trimmed if trimmed.is_dir() else store.variants / variant_id
-    if damage := trimming.verify_variant(folder):
-        raise StoreError("; ".join(damage))
+    folder = trimming.home_of(store.variants, variant_id)
+    _check_damage(trimming.verify_variant(folder))
     modified = (folder / saved_variant.MANIFEST).lstat().st_mtime
     names = (saved_variant.MANIFEST, saved_variant.POINTS, saved_variant.REPORT)
     contents = {name: read_file(folder / name, _MAX_POINTS_BYTES) for name in names}
-    if known := texture.textures(folder):
-        contents[texture.FILE] = json_text(known).encode()
+    if known := trimming.textures(folder):
+        contents[trimming.TEXTURES] = json_text(known).encode()
     return {f"variants/{trimmed.name}/{name}": (of, modified) for name, of in contents.items()}
 
 
@@ -203,34 +193,12 @@ _NOT_COPIED = (NOT_RESULTS - {STATUS}) | {saved_variant.LOG}
 _REQUIRED = ("config.json", "identity.json", "provenance.json", "summary.json", "scores.csv")
 
 
-@dataclass(frozen=True)
-class Imported:
-    """How much an import has added to a store, and which items it has left out."""
-
-    cells: int
-    variants: int
-    scenes: int
-    sweeps: int
-    present: int
-    """How many cells, variants, scenes and records the store had already: they did not change."""
-    left_out: tuple[str, ...]
-    """A line for each reason why something was left out, with the names of the first items."""
-
-    def __str__(self) -> str:
-        counts = _counts(self.cells, self.variants, self.sweeps, self.scenes)
-        return f"imported: {counts}; already there: {self.present}"
-
-
-def import_store(source: Path, store: Store) -> Imported:
-    """Copy a store of somebody else into one's own, after every file is checked.
+def import_store(source: Path, store: Store) -> Copied:
+    """Copy a store of somebody else, an archive or a folder, after every file is checked.
 
     Cells that are not done, checkpoints, logs and reports are not imported. Each cell, variant,
-    scene and record gets its name once it is whole and on the disk. An import that was stopped
-    goes on when it is run again.
-
-    Args:
-        source: The archive (`.tar`, `.tar.xz`, `.tar.gz`, `.tar.bz2`), or the folder of a store.
-        store: The store to copy to; it is made where it is missing.
+    scene and record gets its name once it is whole and on the disk. An import that was stopped goes
+    on when it is run again.
 
     Raises:
         StoreError: The source is no store; an archive is damaged, or has a link or a name outside
@@ -304,7 +272,7 @@ class _Import:
         for folder in (self.home, *(self.home / kind for kind in _NAMES)):
             remove_path(folder / _STAGING)
 
-    def copy_all(self, root: Path) -> Imported:
+    def copy_all(self, root: Path) -> Copied:
         """Check each item of a folder, and copy it to its place in the store."""
         items = [
             path
@@ -327,7 +295,7 @@ class _Import:
             count[kind] += copied
             present += not copied
         lines = (f"{listed(names)}: {why}" for why, names in left_out.items())
-        return Imported(**count, present=present, left_out=tuple(map(for_line, lines)))
+        return Copied(**count, present=present, left_out=tuple(map(for_line, lines)))
 
     def _check(self, item: Path) -> None:
         kind = item.parent.name
@@ -374,8 +342,7 @@ def _check_cell(folder: Path) -> None:
         raise StoreError(f"the cell has {status.state}")
     if missing := set(_REQUIRED) - status.files.keys():
         raise StoreError(f"status.json: files: {min(missing)} is not listed")
-    if damage := cell.verify():
-        raise StoreError("; ".join(damage))
+    _check_damage(cell.verify())
     state = cell.state()
     if state.name != "done":
         raise StoreError(state.reason)
@@ -398,28 +365,20 @@ def _check_variant(folder: Path) -> None:
     is_trimmed = paths.is_trimmed(folder.name)
     if paths.id_of(folder.name) != manifest.id:
         raise StoreError("variant.json: its id is not the name of the folder")
-    if damage := (trimming.verify_variant if is_trimmed else variant.verify)(folder):
-        raise StoreError("; ".join(damage))
+    _check_damage((trimming.verify_variant if is_trimmed else variant.verify)(folder))
     read_struct(folder / saved_variant.REPORT, dict[str, Any])
-    if (folder / texture.FILE).exists():
-        texture.textures(folder)
+    if (folder / trimming.TEXTURES).exists():
+        trimming.textures(folder)
 
 
-def _check_scene(folder: Path) -> None:
-    if damage := scenes.verify(folder):
+def _check_damage(damage: Sequence[str]) -> None:
+    if damage:
         raise StoreError("; ".join(damage))
 
 
 _CHECKS: dict[str, Callable[[Path], object]] = {
     "variants": _check_variant,
-    "scenes": _check_scene,
+    "scenes": lambda folder: _check_damage(scenes.verify(folder)),
     "cells": _check_cell,
     "sweeps": unchanged_record,
 }
-
-
-def _counts(cells: int, variants: int, sweeps: int, scenes: int = 0) -> str:
-    """Return numbers as a text, for example `2 cells, 1 variant, 1 record of sweeps`."""
-    parts = [counted(cells, "cell"), counted(variants, "variant")]
-    parts += [counted(scenes, "rendered scene")] if scenes else []
-    return ", ".join([*parts, f"{counted(sweeps, 'record')} of sweeps"])

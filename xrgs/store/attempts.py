@@ -11,24 +11,20 @@ from __future__ import annotations
 
 import secrets
 import shutil
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict
 from itertools import count
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import msgspec
 
+from xrgs.config import Conf
 from xrgs.errors import UnreadableError
 from xrgs.safeio.atomic import write_json
 from xrgs.safeio.files import list_names, remove_path, sync_name, sync_tree
 from xrgs.store.cell_folder import CONFIG, IDENTITY, LOG, CellFolder
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from xrgs.config import Conf
-    from xrgs.store.schema import Identity
+from xrgs.store.schema import Identity
 
 
 def plan_cell(cell: CellFolder, conf: Conf, identity: Identity) -> None:
@@ -50,13 +46,8 @@ def begin_attempt(cell: CellFolder, is_owner: Callable[[], bool] = lambda: True)
     renamed to `<cell id>.aside-<n>`, so that it can be inspected.
 
     The caller holds the cell's lease. Right before the folder is replaced, `is_owner` is asked
-    whether it still does.
-
-    Returns:
-        False where the lease was lost; nothing has changed then.
-
-    Raises:
-        UnreadableError: A file can't be read now.
+    whether it still does; if not, False is returned and nothing has changed. UnreadableError says
+    that a file can't be read now.
     """
     folder = cell.path
     stopped = _stopped(cell)

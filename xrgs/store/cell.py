@@ -8,41 +8,37 @@ import signal
 import sys
 import time
 import traceback
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from pathlib import Path
 from statistics import fmean
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import msgspec
 
+from xrgs.config import Conf
 from xrgs.evaluation import protocol
 from xrgs.formats.ply import save_ply
+from xrgs.mixture.views import Variant
 from xrgs.runtime import progress
 from xrgs.runtime.machine import peak_rss, set_torch_threads
+from xrgs.runtime.progress import ProgressFile
 from xrgs.runtime.signals import StopRequest, StopSignal
 from xrgs.safeio.atomic import write_json, write_text
 from xrgs.safeio.records import table_text
 from xrgs.safeio.sanitize import for_terminal
 from xrgs.splat.backend import resolve_backend
+from xrgs.splat.gaussians import Gaussians
 from xrgs.store import provenance
+from xrgs.store.cell_folder import CellFolder
 from xrgs.store.schema import Summary
 from xrgs.store.scoring import scoring_code
 from xrgs.training import dataset
-from xrgs.training.checkpoint import Checkpoint, CheckpointError
+from xrgs.training.checkpoint import Checkpoint, CheckpointError, Stateful
 from xrgs.training.components import Components
 from xrgs.training.count_matching import train_cell
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-    from pathlib import Path
-
-    from xrgs.config import Conf
-    from xrgs.mixture.views import Variant
-    from xrgs.runtime.progress import ProgressFile
-    from xrgs.splat.gaussians import Gaussians
-    from xrgs.store.cell_folder import CellFolder
-    from xrgs.training.checkpoint import Stateful
-    from xrgs.training.dataset import Dataset
-    from xrgs.training.recorder import TrainingRecorder, TrainingResult
+from xrgs.training.dataset import Dataset
+from xrgs.training.recorder import TrainingRecorder, TrainingResult
 
 _log = logging.getLogger(__name__)
 

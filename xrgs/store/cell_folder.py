@@ -8,11 +8,14 @@ present and unchanged.
 from __future__ import annotations
 
 import stat
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import msgspec
 
+from xrgs.config import Conf
 from xrgs.errors import StoreError, UnreadableError
 from xrgs.runtime import progress
 from xrgs.safeio.atomic import write_json, write_text
@@ -23,12 +26,8 @@ from xrgs.safeio.sanitize import for_terminal
 from xrgs.store.schema import FileEntry, Identity, Provenance, Status, Summary
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-    from pathlib import Path
-
     import pandas as pd
 
-    from xrgs.config import Conf
     from xrgs.mixture.views import Variant
     from xrgs.splat.cameras import Camera
     from xrgs.splat.gaussians import Gaussians
@@ -67,7 +66,11 @@ class CellState:
 
 @dataclass(frozen=True)
 class CellFolder:
-    """The folder of one cell: its config, its results and its state."""
+    """The folder of one cell: its config, its results and its state.
+
+    Methods that read a file raise StoreError where it is missing or damaged, or was removed by
+    `xrgs-store trim`.
+    """
 
     path: Path
     name: str = ""
@@ -98,10 +101,9 @@ class CellFolder:
     def state(self, *, verify: bool = True, owner: str | None = None) -> CellState:
         """Return whether this cell's result is present and intact.
 
-        Args:
-            verify: Hash the files that reports are made from; otherwise only sizes are compared.
-            owner: Describes the process that holds the cell's lease: it trains the cell, unless
-                that is done.
+        With `verify`, the files that reports are made from are hashed; otherwise only sizes are
+        compared. `owner` describes the process that holds the cell's lease: it trains the cell,
+        unless that is done.
         """
         state = self._state(verify=verify)
         if owner is None or state.name == "done":
@@ -169,9 +171,8 @@ class CellFolder:
     def verify(self) -> list[str]:
         """Hash every file of a finished cell, and decode its JSON.
 
-        Returns:
-            A line for each file that is missing, damaged, has changed, can't be read or does
-            not belong there; empty for an intact cell.
+        Return a line for each file that is missing, damaged, has changed, can't be read or does not
+        belong there; none for an intact cell.
         """
         decoders = {
             IDENTITY: self.identity,
@@ -208,11 +209,9 @@ class CellFolder:
     def finish(self, views: Sequence[str], scored_by: Mapping[str, str]) -> None:
         """Declare the cell done, with the files that are in the folder now.
 
-        All of them are on the disk before the cell says that it is done.
-
-        Args:
-            views: Names of the scored views, in the order of `scores.csv`.
-            scored_by: Digests of the code that scored, see `xrgs.store.scoring`.
+        All of them are on the disk before the cell says that it is done. `views` are the scored
+        views in the order of `scores.csv`, and `scored_by` the digests of the code that scored them
+        (`xrgs.store.scoring`).
         """
         sync_tree(self.path)
         names = sorted(name for name, _ in walk_files(self.path) if name not in NOT_RESULTS)
@@ -263,9 +262,6 @@ class CellFolder:
 
         The caller holds the cell's lease. The status is written first: a cell that is killed in
         between is done, and the next call removes the rest.
-
-        Raises:
-            StoreError: The cell is not done.
         """
         status = self.trimmed_status()
         self._write_status(status)
@@ -301,19 +297,19 @@ class CellFolder:
     # Files
 
     def status(self) -> Status:
-        """Read `status.json`; raises StoreError where it is missing or damaged."""
+        """Read `status.json`."""
         return read_struct(self.status_file, Status)
 
     def identity(self) -> Identity:
-        """Read `identity.json`; raises StoreError where it is missing or damaged."""
+        """Read `identity.json`."""
         return read_struct(self.path / IDENTITY, Identity)
 
     def summary(self) -> Summary:
-        """Read `summary.json`; raises StoreError where it is missing or damaged."""
+        """Read `summary.json`."""
         return read_struct(self.path / "summary.json", Summary)
 
     def provenance(self) -> Provenance:
-        """Read `provenance.json`; raises StoreError where it is missing or damaged."""
+        """Read `provenance.json`."""
         return read_struct(self.path / "provenance.json", Provenance)
 
     def config(self) -> Conf:
@@ -329,11 +325,7 @@ class CellFolder:
         return from_file(self.path / CONFIG)[0]
 
     def view_scores(self) -> list[tuple[str, dict[str, float]]]:
-        """Return the name and the scores of every scored view, NaN where a score is missing.
-
-        Raises:
-            StoreError: `scores.csv` is missing or damaged.
-        """
+        """Return the name and the scores of every scored view, NaN where a score is missing."""
         file = self.path / "scores.csv"
         header, rows = read_table(file)
         views = [row[0] for row in rows]
@@ -351,12 +343,8 @@ class CellFolder:
     def scores(self) -> pd.DataFrame:
         """Return the scores of the scored views.
 
-        Returns:
-            One row a view, indexed by its name (`view`), one column a score (`psnr` in dB, `ssim`,
-            `lpips`); NaN where a score was not computed.
-
-        Raises:
-            StoreError: `scores.csv` is missing or damaged.
+        There is one row a view, indexed by its name (`view`), and one column a score (`psnr` in dB,
+        `ssim`, `lpips`); NaN where a score was not computed.
         """
         import pandas as pd
 
@@ -365,11 +353,7 @@ class CellFolder:
         return pd.DataFrame([values for _, values in scores], index=index)
 
     def history(self) -> pd.DataFrame:
-        """Return the training history, one row per logged step; `view` is text, all else numbers.
-
-        Raises:
-            StoreError: `history.csv` is missing or damaged.
-        """
+        """Return the training history, one row per logged step; only `view` is text."""
         import pandas as pd
 
         file = self.path / "history.csv"
@@ -386,22 +370,14 @@ class CellFolder:
         return table
 
     def gaussians(self) -> Gaussians:
-        """Load the trained Gaussians, in the world of `cameras`.
-
-        Raises:
-            XrgsError: `splats.ply` is missing or damaged, or was removed on purpose.
-        """
+        """Load the trained Gaussians, in the world of `cameras`."""
         from xrgs.formats.ply import read_ply
 
         self.check_not_trimmed("splats.ply")
         return read_ply(self.path / "splats.ply").gaussians
 
     def variant(self) -> Variant:
-        """Load the variant that the cell was trained on, from the store that the cell is in.
-
-        Raises:
-            XrgsError: `identity.json` can't be read, or the variant is not in the store or damaged.
-        """
+        """Load the variant that the cell was trained on, from the store that the cell is in."""
         from xrgs.mixture import variant
         from xrgs.store.trimming import check_images
 
@@ -412,11 +388,8 @@ class CellFolder:
     def dataset(self) -> Dataset:
         """Load the data that the cell was trained and scored on: photographs, cameras, points.
 
-        With `train.validation`, `test` has the held-out training views that its scores are of.
-        The cameras and points are in the normalised world of the Gaussians.
-
-        Raises:
-            XrgsError: As `config` and `variant`.
+        With `train.validation`, `test` has the held-out training views that its scores are of. The
+        cameras and points are in the normalised world of the Gaussians.
         """
         from xrgs.training import dataset
 
@@ -427,17 +400,27 @@ class CellFolder:
     def cameras(self) -> dict[str, dict[str, Camera]]:
         """Load the cameras of the cell's views, in the normalised world of its Gaussians.
 
-        Returns:
-            `{"train": {name: camera}, "test": {name: camera}}`, in the variant's order.
-
-        Raises:
-            XrgsError: As `dataset`, which reads the photographs too.
+        They are `{"train": {name: camera}, "test": {name: camera}}`, in the variant's order. The
+        photographs are read too.
         """
         data = self.dataset()
         splits = {"train": data.train, "test": data.test}
         return {
             split: {view.name: view.camera for view in views} for split, views in splits.items()
         }
+
+
+def number_columns(file: Path) -> dict[str, list[float]]:
+    """Read a table of numbers by columns, without the column `view`, which is text.
+
+    StoreError says that the file is missing or damaged, or that a value is not a number.
+    """
+    header, rows = read_table(file)
+    places = [(place, name) for place, name in enumerate(header) if name != "view"]
+    try:
+        return {name: [as_number(row[place]) for row in rows] for place, name in places}
+    except ValueError as error:
+        raise StoreError(f"damaged: {file}: {error}") from error
 
 
 def _is_heavy(name: str) -> bool:

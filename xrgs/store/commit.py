@@ -8,10 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import subprocess
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from pathlib import Path
+from pathlib import Path
 
 #: The file in the package of a wheel or an sdist that has the result of `of_checkout` at the build.
 FILE = "_commit.json"

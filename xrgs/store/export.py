@@ -12,17 +12,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from xrgs.errors import XrgsError
+from xrgs.mixture.views import Variant
 from xrgs.safeio.atomic import write_json, write_text
 from xrgs.safeio.files import list_names
 from xrgs.store.cell_folder import CellFolder
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from xrgs.mixture.colmap import PinholeImage
-    from xrgs.mixture.views import Variant
     from xrgs.splat.gaussians import Gaussians
     from xrgs.training.dataset import Dataset, LoadedView
 
@@ -32,23 +31,16 @@ SPLAT_FORMATS = ("ply", "glb", "spz")
 
 
 def export(path: Path, layout: str, out: Path) -> str:
-    """Write a cell or a variant for another program.
+    """Write a cell or a variant, by its folder, for another program: `colmap` or `nerfstudio`.
 
-    The folder gets `images/<split>_<view>.png`; `split.json`, with the view, split and tag of each
-    image; `transform.json`, the similarity from the world of SfM to the world of all other files;
-    and, for a cell, `splats.ply`. Cameras and points are in `sparse/0` (`colmap`), or in
-    `transforms.json` and `points.ply` (`nerfstudio`).
+    The folder `out`, which is new or empty, gets `images/<split>_<view>.png`; `split.json`, with
+    the view, split and tag of each image; `transform.json`, the similarity from the world of SfM to
+    the world of all other files; and, for a cell, `splats.ply`. Cameras and points are in
+    `sparse/0` (`colmap`), or in `transforms.json` and `points.ply` (`nerfstudio`).
 
     The images of a cell are its training views and its scored views. Where a view has a mask, each
-    image has one: `masks/<image>.png`, white where a pixel is used.
-
-    Args:
-        path: The folder of a finished cell, or of a variant, in its store.
-        layout: `colmap` or `nerfstudio`.
-        out: The folder to write to; it may exist if it is empty.
-
-    Returns:
-        A line with the numbers of views and points that were written.
+    image has one: `masks/<image>.png`, white where a pixel is used. A line with the numbers of
+    views and points is returned.
 
     Raises:
         XrgsError: The folder is not a finished cell or a variant, or is damaged; there is no such
@@ -81,18 +73,10 @@ def export(path: Path, layout: str, out: Path) -> str:
 
 
 def export_splats(path: Path, form: str, out: Path) -> str:
-    """Write the Gaussians of a cell, or of a file, to one file.
+    """Write the Gaussians of a cell, or of a .ply, .glb or .spz file, to a .ply, .glb or .spz file.
 
     They stay in the normalised world of training. A .glb of a cell is shown with the cameras' mean
-    up direction upwards.
-
-    Args:
-        path: The folder of a finished cell, or a .ply, .glb or .spz file.
-        form: One of `SPLAT_FORMATS`.
-        out: The file, which is replaced.
-
-    Returns:
-        A line with the number of Gaussians.
+    up direction upwards. A line with the number of Gaussians is returned.
 
     Raises:
         XrgsError: The cell or the file can't be read, or `out` ends otherwise or can't be written.
@@ -157,11 +141,7 @@ def _shown(cell: CellFolder) -> Gaussians:
 
 
 def transform(variant: Variant) -> NDArray[np.float64]:
-    """Compute the similarity from the world of SfM, or of given poses, to the world of training.
-
-    Returns:
-        [4, 4]; the upper left [3, 3] is a rotation times the scale.
-    """
+    """Return the similarity [4, 4] from the world of SfM or of given poses to that of training."""
     from xrgs.splat.normalize import normalize_scene
 
     posed = [view.viewmat for view in variant.views if view.split != "original"]

@@ -21,12 +21,11 @@ the identity does not tell them apart. For the gsplat backend it has the version
 from __future__ import annotations
 
 from functools import cache
-from typing import TYPE_CHECKING
 
 import msgspec
 
 from xrgs import plugins
-from xrgs.config import identity_values
+from xrgs.config import Conf, identity_values
 from xrgs.registry import BUILT_IN, file_of, order_of
 from xrgs.safeio.code import CodeFolders, code_digest
 from xrgs.safeio.hashing import digest
@@ -34,9 +33,6 @@ from xrgs.safeio.refactorings import ABSENT, canonical
 from xrgs.splat.backend import arithmetic, check_raster, resolve_backend
 from xrgs.splat.settings import STRATEGIES
 from xrgs.store.schema import Identity
-
-if TYPE_CHECKING:
-    from xrgs.config import Conf
 
 #: The code that trains. The files of backends, the dense start, strategies and components count
 #: where these are on; every other file counts always.
@@ -63,9 +59,8 @@ _STARTS = {"dense": ("training/dense",)}
 def cell_identity(conf: Conf, variant_id: str) -> Identity:
     """Return everything that decides a cell's trained numbers; its digest is the cell's id.
 
-    Raises:
-        XrgsError: The configured backend is not available on this machine, or can't render with
-            these settings, or a plugin is missing.
+    XrgsError says that the configured backend is not available on this machine, or can't render
+    with these settings, or that a plugin is missing.
     """
     backend = resolve_backend(conf.splat.backend)
     check_raster(backend, conf.splat.raster)
@@ -102,10 +97,7 @@ def code_now(
     """Return the digest of each part of the code that trains a cell, of the files as they are now.
 
     The components are the keys of those that are on, and the plugins the sorted names of those of
-    other packages.
-
-    Raises:
-        XrgsError: A plugin is not installed, or has no source file.
+    other packages. XrgsError says that a plugin is not installed, or has no source file.
     """
     files = _files(backend, components, init, strategy)
     code = {part: canonical(part, code_digest(*names)) for part, names in files.items()}

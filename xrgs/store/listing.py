@@ -7,23 +7,20 @@ from __future__ import annotations
 
 import time
 from collections import Counter
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING
 
 from xrgs.errors import StoreError, XrgsError
 from xrgs.runtime.text import listed
 from xrgs.safeio.files import file_bytes
 from xrgs.splat.backend import arithmetic
+from xrgs.store.cell_folder import CellFolder, CellState
 from xrgs.store.identity import changed_code
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-    from pathlib import Path
-
-    from xrgs.store.cell_folder import CellFolder, CellState
-    from xrgs.store.schema import Identity, RecordedCell, SweepRecord
+from xrgs.store.schema import Identity, RecordedCell, SweepRecord
 
 #: The states that a cell of a store can have.
 STATES = ("done", "running", "planned", "unfinished", "failed", "corrupt")
@@ -136,16 +133,12 @@ def cell_rows(
     rows = []
     for cell in cells:
         state = cell.state(verify=verify, owner=holders.get(cell.id))
+        identity = None
+        with suppress(StoreError):
+            identity = cell.identity()
         sweep_ids = tuple(sweeps.get(cell.id, ()))
-        rows.append(CellRow(cell, state, recorded.get(cell.id), sweep_ids, _identity(cell)))
+        rows.append(CellRow(cell, state, recorded.get(cell.id), sweep_ids, identity))
     return sorted(rows, key=lambda row: (row.scene, row.arm, row.seed or 0, row.id))
-
-
-def _identity(cell: CellFolder) -> Identity | None:
-    try:
-        return cell.identity()
-    except StoreError:
-        return None
 
 
 @dataclass(frozen=True)
@@ -164,18 +157,18 @@ def sweep_rows(
     folder: Path, records: Mapping[str, SweepRecord], cells: Iterable[CellRow]
 ) -> list[SweepRow]:
     """List recorded sweeps, the latest last, whose records are in a folder."""
-    states = {cell.id: cell.state.name for cell in cells}
-
-    def state(row: RecordedCell) -> str:
-        if row.error:
-            return "failed"
-        name = states.get(row.cell_id or "", "absent")
-        return "pending" if name in {"absent", "planned", "unfinished"} else name
-
-    return [
-        SweepRow(i, record, modified(folder / f"{i}.json"), Counter(map(state, record.cells)))
-        for i, record in records.items()
-    ]
+    states: dict[str | None, str] = {
+        cell.id: cell.state.name
+        for cell in cells
+        if cell.state.name not in {"absent", "planned", "unfinished"}
+    }
+    rows = []
+    for name, record in records.items():
+        of_cells = (
+            "failed" if row.error else states.get(row.cell_id, "pending") for row in record.cells
+        )
+        rows.append(SweepRow(name, record, modified(folder / f"{name}.json"), Counter(of_cells)))
+    return rows
 
 
 def modified(file: Path) -> float | None:
@@ -184,61 +177,6 @@ def modified(file: Path) -> float | None:
         return file.stat().st_mtime_ns / 1e9
     except OSError:
         return None
-
-
-@dataclass(frozen=True)
-class Selection:
-    """Which cells of a store are meant; an empty value or 0 restricts nothing."""
-
-    ids: tuple[str, ...] = ()
-    """Ids, beginnings of ids, or names of scenes with one done cell."""
-    scenes: tuple[str, ...] = ()
-    ablations: tuple[str, ...] = ()
-    states: tuple[str, ...] = ()
-    sweeps: tuple[str, ...] = ()
-    """Ids of sweeps; a chosen cell is in one of them."""
-    older_days: float = 0.0
-    larger_mb: float = 0.0
-
-    @property
-    def restricts(self) -> bool:
-        """Whether any value restricts the choice."""
-        return self != Selection()
-
-    def choose_from(self, cells: Sequence[CellRow]) -> list[CellRow]:
-        """Return the cells that are meant.
-
-        Raises:
-            XrgsError: No cell has a name that is given, or several ids have one beginning.
-        """
-        ids = [cell.id for cell in cells]
-        done = [cell for cell in cells if cell.state.name == "done"]
-        named = {
-            full_id(word, ids, done={cell.id: cell.arm for cell in done if cell.scene == word})
-            for word in self.ids
-        }
-        self._check("scenes", self.scenes, [cell.scene for cell in cells])
-        self._check("ablations", self.ablations, [cell.label for cell in cells])
-        self._check("states", self.states, STATES)
-        self._check("sweep", self.sweeps, [name for cell in cells for name in cell.sweeps])
-        return [
-            cell
-            for cell in cells
-            if (not named or cell.id in named)
-            and (not self.scenes or cell.scene in self.scenes)
-            and (not self.ablations or cell.label in self.ablations)
-            and (not self.states or cell.state.name in self.states)
-            and (not self.sweeps or not {*self.sweeps}.isdisjoint(cell.sweeps))
-            and (not self.older_days or (cell.age_s or 0.0) >= 86400 * self.older_days)
-            and (not self.larger_mb or (cell.bytes or 0) >= 1e6 * self.larger_mb)
-        ]
-
-    @staticmethod
-    def _check(key: str, names: Sequence[str], existing: Sequence[str]) -> None:
-        for name in names:
-            if name not in existing:
-                choices = ", ".join(dict.fromkeys(existing)) or "none"
-                raise XrgsError(f"{key}={name}: no cell has that; choose from: {choices}")
 
 
 def size_of(path: Path) -> int | None:

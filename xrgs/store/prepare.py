@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from xrgs.config import Conf
 from xrgs.mixture import variant
 from xrgs.splat.torch_defaults import on_cpu_in_float32
 from xrgs.store.inspect import read_report
 from xrgs.training import dataset
-
-if TYPE_CHECKING:
-    from xrgs.config import Conf
-    from xrgs.training.dataset import Dataset
+from xrgs.training.dataset import Dataset
 
 _log = logging.getLogger(__name__)
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 import platform
 import re
 import sys
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import xrgs
 from xrgs.evaluation.lpips import weights
@@ -19,21 +20,9 @@ from xrgs.splat.backend import arithmetic, device
 from xrgs.store import commit
 from xrgs.store.schema import Provenance
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
 _PACKAGES = ("torch", "numpy", "pycolmap", "kornia", "scikit-image", "hydra-core", "pandas")
 #: The fields that a cell's times depend on, apart from the program.
 MACHINE_KEYS = ("cpu", "gpu", "instruction_set", "threads", "backend")
-
-
-def _commit() -> Mapping[str, str | None]:
-    """Return `git` and `git_diff_sha256` of the package: of its checkout, or of its build."""
-    package = Path(xrgs.__file__).parent
-    source = commit.of_checkout(package.parent)
-    if source is None and (package / commit.FILE).is_file():
-        source = read_struct(package / commit.FILE, dict[str, str | None])
-    return source or {}
 
 
 def _cpu() -> str:
@@ -57,16 +46,15 @@ def _instruction_set(backend: str) -> str | None:
 def collect(threads: int, backend: str) -> Provenance:
     """Return the program, its libraries, the machine and the time.
 
-    Args:
-        threads: The threads that the cell uses.
-        backend: `native`, `torch` or `gsplat`.
-
     Raises:
         WeightsError: The weights of LPIPS on this machine are not the published ones. A cell that
             can't be scored is better stopped here than after its training.
         XrgsError: The backend is not available on this machine.
     """
-    built_from = _commit()
+    package = Path(xrgs.__file__).parent
+    built_from = commit.of_checkout(package.parent) or {}
+    if not built_from and (package / commit.FILE).is_file():
+        built_from = read_struct(package / commit.FILE, dict[str, str | None])
     gpu: str | None = None
     if device(backend) == "cuda":
         import torch

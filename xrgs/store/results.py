@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 import numpy as np
 import pandas as pd
 
+from xrgs.composing import dotted
 from xrgs.errors import StoreError, XrgsError
 from xrgs.evaluation.metrics import METRICS
 from xrgs.safeio.sanitize import for_line
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
-
-    from xrgs.store.cell_folder import CellFolder
-    from xrgs.store.schema import RecordedCell, Summary
+from xrgs.store.cell_folder import CellFolder
+from xrgs.store.schema import RecordedCell, Summary
 
 #: The names of a cell in a sweep's record.
 CELL_NAMES = ("scene", "label", "condition")
@@ -51,7 +49,11 @@ def cell_columns(cell: CellFolder, names: RecordedCell | None) -> dict[str, Any]
         config = asdict(cell.config())
     except XrgsError:
         config = {}
-    settings = dict(_flat({name: config[name] for name in _CONFIG_GROUPS if name in config}))
+    groups = {name: config[name] for name in _CONFIG_GROUPS if name in config}
+    settings = {
+        for_line(key): for_line(value) if isinstance(value, str) else value
+        for key, value in dotted(groups)
+    }
     return {
         **settings,
         "cell_id": cell.id,
@@ -63,29 +65,13 @@ def cell_columns(cell: CellFolder, names: RecordedCell | None) -> dict[str, Any]
     }
 
 
-def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield nested values under dotted names, as `train.steps`."""
-    for name, value in values.items():
-        key = for_line(f"{prefix}{name}")
-        if isinstance(value, dict):
-            yield from _flat(value, f"{key}.")
-        else:
-            yield key, for_line(value) if isinstance(value, str) else value
-
-
 def over_views(views: pd.DataFrame) -> pd.DataFrame:
-    """Return the scores of each cell.
+    """Return the scores of each cell: means over its views, `psnr_pooled` and `psnr_worst`.
 
     `psnr_pooled` is the PSNR of the views' squared errors together, -10 log10(mean(10^(-PSNR/10))),
     in which each view counts once. A view that is far off counts for more in it than in the mean of
-    PSNR. `psnr_worst` is the lowest PSNR.
-
-    Args:
-        views: One row for each view: `cell_id`, `psnr` in dB, and a column for each other score.
-
-    Returns:
-        One row for each cell, indexed by its id: the mean of each score over the views,
-        `psnr_pooled` and `psnr_worst`. A score that one view lacks is NaN.
+    PSNR. `psnr_worst` is the lowest PSNR. `views` has a row for each view: `cell_id`, `psnr` in dB,
+    and a column for each other score. A score that one view lacks is NaN.
     """
     errors = 10 ** (-views["psnr"] / 10)
     grouped = views.assign(psnr_pooled=errors, psnr_worst=views["psnr"]).groupby("cell_id")

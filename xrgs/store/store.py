@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import stat
 import tempfile
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,16 +29,11 @@ from xrgs.safeio.records import list_folder, read_struct
 from xrgs.safeio.sanitize import for_line
 from xrgs.store import listing
 from xrgs.store.cell_folder import IDENTITY, CellFolder, CellState
-from xrgs.store.listing import modified
-from xrgs.store.schema import SweepRecord
+from xrgs.store.listing import CellRow, SweepRow, modified
+from xrgs.store.schema import RecordedCell, SweepRecord
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
     import pandas as pd
-
-    from xrgs.store.listing import CellRow, SweepRow
-    from xrgs.store.schema import RecordedCell
 
 
 #: Label of the cells that all others are compared to.
@@ -56,7 +51,6 @@ class StoreGoneError(StoreError):
     """The store was moved, deleted or unmounted while a sweep used it."""
 
 
-@dataclass(frozen=True)
 class Store:
     """A store: everything that sweeps keep, in one folder.
 
@@ -69,41 +63,21 @@ class Store:
         >>> gaussians = load_gaussians(file).gaussians
     """
 
-    path: Path
-    """The folder."""
-
     def __init__(self, path: str | Path) -> None:
-        object.__setattr__(self, "path", Path(path))
-
-    @property
-    def scenes(self) -> Path:
+        self.path = Path(path)
+        """The folder."""
+        self.scenes = self.path / "scenes"
         """Folder of the rendered photographs of procedural scenes."""
-        return self.path / "scenes"
-
-    @property
-    def variants(self) -> Path:
+        self.variants = self.path / "variants"
         """Folder of the frozen variants."""
-        return self.path / "variants"
-
-    @property
-    def cells_folder(self) -> Path:
+        self.cells_folder = self.path / "cells"
         """Folder of the cells."""
-        return self.path / "cells"
-
-    @property
-    def leases(self) -> Path:
+        self.leases = self.path / "locks"
         """Folder of the leases of cells that are being trained."""
-        return self.path / "locks"
-
-    @property
-    def sweeps(self) -> Path:
+        self.sweeps = self.path / "sweeps"
         """Folder of the records of sweeps."""
-        return self.path / "sweeps"
-
-    @property
-    def reports(self) -> Path:
+        self.reports = self.path / "reports"
         """Folder of the reports: tables and figures."""
-        return self.path / "reports"
 
     @property
     def exists(self) -> bool:
@@ -146,8 +120,7 @@ class Store:
     def prepare(self) -> None:
         """Create the folder and its subfolders, and check that the disk has room.
 
-        Raises:
-            StoreError: The folder can't be written; the message names it and the `store` key.
+        StoreError says that the folder can't be written, and names it and the `store` key.
         """
         try:
             self.path.mkdir(parents=True, exist_ok=True)
@@ -159,11 +132,7 @@ class Store:
         self.check_room()
 
     def check_room(self) -> None:
-        """Check that the disk has room, and leave nothing behind; the folder need not exist yet.
-
-        Raises:
-            StoreError: As `prepare`.
-        """
+        """Check that the disk has room, and leave nothing behind; the folder need not exist yet."""
         folder = self.path.absolute()
         while not folder.exists() and not folder.is_symlink():
             folder = folder.parent
@@ -181,14 +150,7 @@ class Store:
         )
 
     def cell(self, cell_id: str) -> CellFolder:
-        """Return the folder of a cell, which need not exist.
-
-        Args:
-            cell_id: The cell's id.
-
-        Raises:
-            StoreError: The id is not a valid name of a folder.
-        """
+        """Return the folder of a cell, which need not exist; StoreError if its id is no name."""
         if not is_name(cell_id):
             raise StoreError(f"{cell_id!r:.80} is not the id of a cell")
         return CellFolder(self.cells_folder / cell_id)
@@ -321,25 +283,18 @@ class Store:
         """Return the cells, sorted by id, without folders of earlier attempts (`<id>.aside-1`).
 
         A link or a file with the name of a cell is among them; its state says that it is corrupt.
-
-        Raises:
-            StoreError: The folder of cells can't be listed.
         """
         names = list_folder(self.cells_folder)
         return [self.cell(name) for name in names if "." not in name and is_name(name)]
 
     def sweep_ids(self) -> list[str]:
-        """Return the ids of the recorded sweeps, oldest first.
-
-        Raises:
-            StoreError: The folder of the records can't be listed.
-        """
+        """Return the ids of the recorded sweeps, oldest first."""
         names = [name for name in list_folder(self.sweeps) if name.endswith(".json")]
         files = [self.sweeps / name for name in names if is_name(name)]
         return [file.stem for file in sorted(files, key=lambda file: (modified(file) or 0, file))]
 
     def records(self) -> tuple[dict[str, SweepRecord], tuple[str, ...]]:
-        """Read the records of all sweeps, oldest first, by their ids; raises as `sweep_ids`.
+        """Read the records of all sweeps, oldest first, by their ids.
 
         For each one that can't be read there is a message that names its file.
         """
@@ -361,7 +316,9 @@ class Store:
         """
         rows = msgspec.to_builtins(tuple(cells))
         record = SweepRecord(1, tuple(command), tuple(cells), digest(rows))
-        sweep_id = sweep_id or digest([_asked_for(row) for row in rows])
+        if sweep_id is None:  # of what is known before any cell is trained
+            names = ("scene", "label", "condition", "variant_seed", "seed", "variant_id")
+            sweep_id = digest([{n: row[n] for n in (*names, "planned_id")} for row in rows])
         write_json(self.sweeps / f"{sweep_id}.json", msgspec.to_builtins(record))
         return sweep_id
 
@@ -390,11 +347,7 @@ class Store:
         raise damaged[0]
 
     def sweep_record(self, sweep_id: str | None = None) -> SweepRecord:
-        """Return the record of a sweep; None for the latest.
-
-        Raises:
-            StoreError: There is no such record, or it is damaged or of another version.
-        """
+        """Return the record of a sweep; None for the latest."""
         sweep_id = sweep_id or self.latest_sweep()
         if not is_name(sweep_id):
             raise StoreError(f"{sweep_id!r:.80} is not the id of a sweep")
@@ -402,11 +355,7 @@ class Store:
 
 
 def unchanged_record(file: Path) -> SweepRecord:
-    """Read the record of a sweep, and check by the hash in it that it is the one that was written.
-
-    Raises:
-        StoreError: The record can't be read, or has changed; the message names the file.
-    """
+    """Read the record of a sweep, and check by the hash in it that nobody has changed it."""
     record = read_struct(file, SweepRecord, _MAX_RECORD_BYTES)
     if digest(msgspec.to_builtins(record.cells)) != record.digest:
         raise StoreError(f"{file}: its cells have changed since it was written")
@@ -416,9 +365,3 @@ def unchanged_record(file: Path) -> SweepRecord:
 def _name_of(word: str) -> str:
     """Return a word; where it is a folder, the name of the scene in the folder."""
     return scene_name(user_path(word)) if user_path(word).is_dir() else word
-
-
-def _asked_for(row: dict[str, Any]) -> dict[str, Any]:
-    """Return the part of a record's row that is known before any cell is trained."""
-    names = ("scene", "label", "condition", "variant_seed", "seed", "variant_id", "planned_id")
-    return {name: row[name] for name in names}

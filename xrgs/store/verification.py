@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import stat
 import time
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
 from functools import partial
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from xrgs.errors import StoreError
 from xrgs.mixture import paths, variant
@@ -17,31 +17,16 @@ from xrgs.safeio.files import walk_files
 from xrgs.safeio.records import list_folder
 from xrgs.safeio.sanitize import for_line
 from xrgs.store import trimming
-from xrgs.store.store import unchanged_record
+from xrgs.store.store import Store, unchanged_record
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from pathlib import Path
-
-    from xrgs.store.store import Store
-
-    _Checks = Iterator[tuple[Path, Callable[[], list[str]]]]
+_Checks = Iterator[tuple[Path, Callable[[], list[str]]]]
 
 
-@dataclass(frozen=True)
-class Verification:
-    """The extent of a verification, and the damage that it has found."""
-
-    files: int
-    bytes: int
-    seconds: float
-    damage: tuple[str, ...]
-    """A line for each file that is missing, damaged, changed, unreadable or not listed. The line
-    begins with the path."""
-
-
-def verify(store: Store) -> Verification:
+def verify(store: Store) -> tuple[str, list[str]]:
     """Hash every file of the finished cells, the frozen variants, the scenes and the records.
+
+    Return lines for a terminal on the damage and the number of files, and a line for each file that
+    is missing, damaged, changed, unreadable or not listed, which begins with its path.
 
     Raises:
         StoreError: There is no such store, or it can't be read now.
@@ -56,17 +41,11 @@ def verify(store: Store) -> Verification:
             damage += check()
             bar.update(size)
     seconds = time.perf_counter() - start
-    return Verification(sum(files for files, *_ in parts), total, seconds, tuple(damage))
-
-
-def describe(verification: Verification) -> str:
-    """Return the damaged files and the extent of a verification, as lines for a terminal."""
-    damage = verification.damage
     lines = ["damaged, or can't be read:", *(f"  {line}" for line in damage)] if damage else []
-    extent = f"{verification.files:,} files, {format_size(verification.bytes)}"
+    extent = f"{sum(files for files, *_ in parts):,} files, {format_size(total)}"
     result = f"{len(damage)} damaged" if damage else "all of them as they were written"
-    lines.append(f"hashed: {extent}, in {verification.seconds:.1f} s; {result}")
-    return "\n".join(map(for_line, lines))
+    lines.append(f"hashed: {extent}, in {seconds:.1f} s; {result}")
+    return "\n".join(map(for_line, lines)), damage
 
 
 def _parts(store: Store, damage: list[str]) -> Iterator[tuple[int, int, Callable[[], list[str]]]]:
@@ -117,12 +96,12 @@ def _scenes(store: Store) -> _Checks:
 def _records(store: Store) -> _Checks:
     for sweep_id in store.sweep_ids():
         file = store.sweeps / f"{sweep_id}.json"
-        yield file, partial(_record, file)
 
+        def check(file: Path = file) -> list[str]:
+            try:
+                unchanged_record(file)
+            except StoreError as error:
+                return [str(error)]
+            return []
 
-def _record(file: Path) -> list[str]:
-    try:
-        unchanged_record(file)
-    except StoreError as error:
-        return [str(error)]
-    return []
+        yield file, check

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import shlex
 import threading
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
-from xrgs.config import CONF_DIR
+from xrgs.config import CONF_DIR, Conf, SceneConf, VariantConf
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.mixture import photographs, split, variant
 from xrgs.mixture.degradations import DEGRADATIONS, resolve_degradation
@@ -23,14 +25,8 @@ from xrgs.safeio.files import is_transient
 from xrgs.safeio.sanitize import counted
 from xrgs.store import trimming
 from xrgs.store.inspect import read_report
-from xrgs.store.store import StoreGoneError
+from xrgs.store.store import Store, StoreGoneError
 from xrgs.sweep import job
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
-
-    from xrgs.config import Conf, SceneConf, VariantConf
-    from xrgs.store.store import Store
 
 _Result = TypeVar("_Result")
 #: Memory that a build may take; fern and flower take 0.6 GB each at 500 px.
@@ -59,12 +55,9 @@ def build(
 ) -> str:
     """Build the variant of a config in a child process, and return its id.
 
-    A message tells the `place` among several builds. The child is ended when `is_over`, and has
-    the variables of `environment` besides those of this process.
-
-    Raises:
-        WorkError: The build failed, or the disk is full or can't be written.
-        XrgsError: The photographs are missing, or can't be made into a variant.
+    A message tells the `place` among several builds. The child is ended when `is_over`, and has the
+    variables of `environment` besides those of this process. WorkError says that the build failed,
+    or the disk is full or can't be written.
     """
 
     def on_poll(_: int) -> None:
@@ -138,13 +131,9 @@ def find_or_build(conf: Conf, store: Store) -> str:
 def plan(confs: Sequence[Conf], store: Store, *, allow_build: bool) -> list[PlannedVariant]:
     """Return the variants of configs for a sweep, or the reasons why there are none.
 
-    The variants that the store lacks are built, several at once. A scene that failed before is not
-    tried again, like a failed cell, unless `retry=failed`.
-
-    In a dry run `allow_build` is False.
-
-    Raises:
-        StoreError: The store can't be written, or is no longer there.
+    The variants that the store lacks are built, several at once, unless `allow_build` is False, as
+    in a dry run. A scene that failed before is not tried again, like a failed cell, unless
+    `retry=failed`. StoreError says that the store can't be written, or is no longer there.
     """
     stored = [_outcome(_stored_variant, conf, store) for conf in confs]
     lacking = {i: confs[i] for i, planned in enumerate(stored) if planned is None}
@@ -220,14 +209,10 @@ def _outcome(
             # COLMAP dies of a full disk without saying so. The scene is not at fault then.
             store.check_room()
         # The reason that the store keeps: a sweep that is planned again has the same record then.
-        return _failure(conf, store) or PlannedVariant(error=str(error))
-
-
-def _failure(conf: Conf, store: Store) -> PlannedVariant | None:
-    try:
-        return _failed_before(store, variant.key(conf.scene, conf.variant))
-    except XrgsError:  # the photographs are not there, or the reason can't be read now
-        return None
+        with suppress(XrgsError):  # the photographs are not there, or it can't be read now
+            if failed := _failed_before(store, variant.key(conf.scene, conf.variant)):
+                return failed
+        return PlannedVariant(error=str(error))
 
 
 def _failed_before(store: Store, key: str) -> PlannedVariant | None:

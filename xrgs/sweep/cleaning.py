@@ -9,10 +9,11 @@ from __future__ import annotations
 import re
 import time
 from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from xrgs.errors import StoreError, XrgsError
 from xrgs.mixture import paths
@@ -23,14 +24,8 @@ from xrgs.safeio.records import list_folder
 from xrgs.safeio.sanitize import counted, for_line
 from xrgs.store import trimming
 from xrgs.store.attempts import remove_cell
-from xrgs.store.listing import size_of
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
-    from pathlib import Path
-
-    from xrgs.store.listing import CellRow
-    from xrgs.store.store import Store
+from xrgs.store.listing import CellRow, size_of
+from xrgs.store.store import Store
 
 #: What `gc` removes, by the names that choose it.
 GARBAGE = ("old_code", "failed", "aside", "variants")

@@ -13,23 +13,19 @@ from contextlib import suppress
 from dataclasses import asdict, astuple, dataclass
 from datetime import datetime
 from functools import cache
+from pathlib import Path
 from statistics import fmean, median
-from typing import TYPE_CHECKING, Any
 
+from xrgs.composing import dotted
+from xrgs.config import Conf
 from xrgs.errors import StoreError, XrgsError
 from xrgs.mixture import saved_variant
-from xrgs.mixture.paths import trimmed_folder
+from xrgs.mixture.saved_variant import ViewEntry
 from xrgs.splat.backend import resolve_backend
+from xrgs.store.cell_folder import CellFolder
 from xrgs.store.provenance import processor, this_processor
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-    from pathlib import Path
-
-    from xrgs.config import Conf
-    from xrgs.mixture.saved_variant import ViewEntry
-    from xrgs.store.cell_folder import CellFolder
-    from xrgs.store.store import Store
+from xrgs.store.store import Store
+from xrgs.store.trimming import home_of
 
 #: Assumed Gaussians of a cell for each pixel of its largest view, mean over the steps, while the
 #: store has no finished cell. In least squares of 111 cells of 2,000 steps at 500 px on one thread
@@ -166,25 +162,14 @@ def _scaled(past: _Finished, conf: Conf, pixels: float, threads: int, backend: s
 
 def _settings(conf: Conf) -> frozenset[tuple[str, str]]:
     groups = {name: asdict(getattr(conf, name)) for name in ("splat", "train", "components")}
-    return frozenset(_flat(groups))
-
-
-def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Yield each value of nested dicts with its dotted key, as `splat.densify.every`."""
-    for key, value in values.items():
-        if isinstance(value, dict):
-            yield from _flat(value, f"{prefix}{key}.")
-        elif f"{prefix}{key}" not in {"train.steps", "splat.backend"}:
-            yield f"{prefix}{key}", repr(value)
+    ignored = {"train.steps", "splat.backend"}
+    return frozenset((key, repr(value)) for key, value in dotted(groups) if key not in ignored)
 
 
 @cache
 def read_views(variants: Path, variant_id: str) -> tuple[ViewEntry, ...]:
     """Return the list of a variant's views, trimmed or not."""
-    folder = variants / variant_id
-    if not folder.is_dir():
-        folder = trimmed_folder(variants, variant_id)
-    return saved_variant.read_manifest(folder).views
+    return saved_variant.read_manifest(home_of(variants, variant_id)).views
 
 
 def _pixels(variants: Path, variant_id: str, conf: Conf) -> tuple[float, int]:

@@ -21,8 +21,10 @@ import sys
 import tempfile
 import time
 import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from itertools import cycle
 from pathlib import Path
 from types import MappingProxyType
@@ -30,34 +32,27 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from xrgs.config import Conf, LimitsConf
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.mixture.paths import trimmed_folder
-from xrgs.runtime import lease, processes
-from xrgs.runtime.machine import (
-    gpus,
-    set_huge_pages,
-    set_portable_blas,
-    set_portable_mkl,
-)
+from xrgs.runtime import lease, machine
+from xrgs.runtime.machine import gpus, set_huge_pages, set_portable_blas, set_portable_mkl
 from xrgs.runtime.progress import log_line
 from xrgs.runtime.signals import StopRequest, StopSignal, end_by_sigterm
 from xrgs.runtime.streams import guard_streams, log_to_stderr, say
 from xrgs.safeio.atomic import write_json
+from xrgs.safeio.files import is_transient, read_bytes
 from xrgs.safeio.records import read_struct
+from xrgs.safeio.sanitize import for_line
 from xrgs.splat.backend import arithmetic
 from xrgs.store.attempts import begin_attempt
 from xrgs.store.cell_folder import LOG, CellFolder
 from xrgs.store.identity import changed_code
+from xrgs.store.schema import Identity
 from xrgs.store.store import Store
-from xrgs.sweep.session import SweepSession
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
-
     from omegaconf import DictConfig
-
-    from xrgs.config import Conf, LimitsConf
-    from xrgs.store.schema import Identity
 
 #: Outcomes of a job other than the states of a cell. LOCKED: another process trains the cell.
 #: STOPPED: the sweep is over, or no further job may begin. UNWRITABLE: the store can't be written.
@@ -71,6 +66,8 @@ FAIL_FAST, STORE_FULL = "fail_fast, and a cell failed", "the store can't be writ
 NOTHING_LOST = (
     "Finished cells are kept: when there is room to write, run the same command again to continue."
 )
+#: The most bytes that are read of the file `stopped` of a session.
+_MAX_REASON = 1 << 12
 #: Seconds between two looks for a free GPU.
 _GPU_POLL_S = 0.2
 #: Errors of a file system that takes no more writes.
@@ -125,6 +122,64 @@ class WorkError(XrgsError):
         self.outcome = outcome
 
 
+@dataclass(frozen=True)
+class SweepSession:
+    """The folder of one call of `xrgs-sweep`, by which its jobs know the call.
+
+    It is in the store, so that jobs on other machines see it. Its file `sweep` names the call's
+    process, and its file `stopped` says why no further job may begin.
+    """
+
+    folder: Path
+    brief: bool = False
+    """Whether the jobs print only failures, as for `xrgs-train`."""
+
+    @property
+    def exists(self) -> bool:
+        """Whether the folder is there and belongs to a call."""
+        return (self.folder / "sweep").is_file()
+
+    def stop(self, reason: str) -> None:
+        """Let no further job begin; keep the reason, unless an earlier one is there."""
+        # A full disk may have room for the file's name and none for the reason in it.
+        with suppress(OSError), (self.folder / "stopped").open("xb") as stream:
+            stream.write(reason.encode())
+
+    def end(self) -> None:
+        """Remove the folder when no job is left, unless a launcher has left its logs in it."""
+        files = {self.folder / "sweep", self.folder / "stopped"}
+        with suppress(OSError):  # a folder that stays disturbs nobody
+            for job_folder in set(self.folder.iterdir()) - files:
+                job_folder.rmdir()  # fails where there are logs: then all of the folder stays
+            for file in files:
+                file.unlink(missing_ok=True)
+            self.folder.rmdir()
+
+    @cached_property
+    def _owner(self) -> lease.Owner | None:
+        return lease.signature(self.folder / "sweep")
+
+    @property
+    def owner_dead(self) -> bool:
+        """Whether the process of this call has ended; False if it ran on another machine."""
+        return self._owner is not None and self._owner.here and not self._owner.lives
+
+    @property
+    def stopped(self) -> str:
+        """Why no further job may begin; empty while they may."""
+        file = self.folder / "stopped"
+        try:
+            reason = read_bytes(file, _MAX_REASON).decode(errors="replace")
+            return for_line(reason) or f"{file} exists"
+        except FileNotFoundError:
+            if not self.folder.exists():
+                return f"{self.folder} is no longer there"
+        except OSError as error:
+            if not is_transient(error):  # something else has that name
+                return f"{file} exists"
+        return "the process of the sweep has ended" if self.owner_dead else ""
+
+
 # A cell's job, in the process that the launcher has started
 
 
@@ -152,10 +207,7 @@ def run_hydra_job(cfg: DictConfig) -> str:
 
 
 def run_job(session: SweepSession, store: Store, cell_id: str, name: str) -> str:
-    """Run one cell of a sweep, unless there is a reason not to.
-
-    Returns:
-        The cell's state, or `LOCKED`, `STOPPED`, `UNWRITABLE`, `GONE` or `INTERRUPTED`.
+    """Run one cell of a sweep, unless there is a reason not to; return its outcome or its state.
 
     Raises:
         XrgsError: The installed code is not the planned one, or the variant of the cell is missing,
@@ -432,7 +484,7 @@ def _watch(
     while child.poll() is None:
         if minutes and time.monotonic() - start > 60 * minutes:
             return f"it took longer than limits.minutes={minutes:g} and was ended"
-        if memory_gb and (used := processes.resident_bytes(child.pid) / 1e9) > memory_gb:
+        if memory_gb and (used := machine.resident_bytes(child.pid) / 1e9) > memory_gb:
             return (
                 f"out of memory: it used {used:.2f} GB, more than limits.memory_gb={memory_gb:g},"
                 " and was ended"
@@ -555,7 +607,7 @@ def main(work: str, request: str, answer: str) -> None:
     guard_streams()
     faulthandler.enable()
     follow_parent()
-    processes.offer_to_oom_killer()
+    machine.offer_to_oom_killer()
     given: dict[str, Any] = {}
     try:
         given = read_struct(Path(request), dict[str, Any])

@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from xrgs.errors import XrgsError
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from omegaconf import DictConfig
 
 
 @dataclass(frozen=True)

@@ -10,27 +10,23 @@ import math
 import sys
 import threading
 import time
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from pathlib import Path
 from statistics import fmean
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 from tqdm import tqdm
 
 from xrgs.runtime import progress
-from xrgs.runtime.progress import log_line
+from xrgs.runtime.progress import Progress, log_line
 from xrgs.runtime.streams import is_terminal
 from xrgs.runtime.text import format_duration
 from xrgs.safeio.files import list_names
 from xrgs.safeio.sanitize import for_line
 from xrgs.store.cell_folder import CellFolder
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-    from pathlib import Path
-
-    from xrgs.runtime.progress import Progress
-    from xrgs.sweep.plan import PlannedCell
+from xrgs.sweep.plan import PlannedCell
 
 #: Least seconds between two snapshots.
 _POLL_S = 1.0

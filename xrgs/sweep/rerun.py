@@ -9,13 +9,16 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 
 from xrgs import composing
+from xrgs.composing import dotted
+from xrgs.config import Conf
 from xrgs.errors import XrgsError
 from xrgs.runtime.machine import usable_cores
 from xrgs.runtime.progress import log_line
@@ -26,6 +29,7 @@ from xrgs.store import provenance
 from xrgs.store.attempts import begin_attempt, free_name, plan_cell
 from xrgs.store.cell_folder import CellFolder
 from xrgs.store.identity import cell_identity
+from xrgs.store.schema import Identity
 from xrgs.store.store import Store
 from xrgs.sweep import build_variants, job
 from xrgs.sweep.axes import CellSpec
@@ -33,16 +37,12 @@ from xrgs.sweep.estimate import Cost
 from xrgs.sweep.monitor import SweepMonitor
 from xrgs.sweep.plan import PlannedCell
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-
-    from xrgs.config import Conf
-    from xrgs.store.schema import Identity
-
 #: Files of results that are compared byte for byte.
 _RESULTS = ("scores.csv", "history.csv", "splats.ply")
 #: Figures of the summary that are compared; times and memory differ from run to run.
 _COUNTS = ("steps", "gaussians", "evaluations", "grow_grad2d")
+#: Entries of the provenance that are not compared, or are compared otherwise.
+_NOT_COMPARED = {"started", "arithmetic", "machines_in_turn"}
 #: A value that differs is cut to this many characters.
 _MAX_VALUE = 60
 
@@ -78,16 +78,9 @@ def rerun(
 ) -> RerunResult:
     """Train a finished cell again and compare the results.
 
-    Args:
-        folder: The cell's folder, in a store or elsewhere.
-        out: Folder to write to; by default `<folder>.rerun-1`, or the next free number.
-        store: The store that has the cell's variant, or in which the variant is built; by default
-            the store that the folder is in.
-        threads: Number of threads; by default as many as the cell was trained with. No result
-            should depend on it.
-        photographs: Replaces the config's `scene.path`, if the variant has to be built.
-        plugins: Names of the components of other packages that may be imported. A cell that needs
-            another one is refused: a store must not decide which code is imported.
+    The arguments are those of `xrgs-sweep rerun=` (`xrgs.cli.sweep.RerunConf`). A cell that needs a
+    component of another package that is not among `plugins` is refused: a store must not decide
+    which code is imported.
 
     Raises:
         XrgsError: The folder has no finished cell, or a config with unknown keys; the variant is
@@ -166,19 +159,13 @@ def _differences_before(
         if then.code.get(part) != now.code.get(part):
             yield f"code: {part}: {then.code.get(part)} -> {now.code.get(part)}"
     here = provenance.collect(conf.threads or usable_cores(), conf.splat.backend)
-    made, made_now = (msgspec.to_builtins(one) for one in (original.provenance(), here))
-    for name in sorted(made_now.keys() - {"started", "arithmetic", "machines_in_turn"}):
-        yield from _changes(made[name], made_now[name], name)
-
-
-def _changes(then: Any, now: Any, name: str) -> Iterator[str]:
-    """Yield a line for a value that differs; for a dict, one for each entry that does."""
-    if isinstance(now, dict):
-        for key in sorted(then.keys() | now.keys()):
-            yield from _changes(then.get(key), now.get(key), f"{name}.{key}")
-    elif then != now:
-        before, after = (for_line(str(value), _MAX_VALUE) for value in (then, now))
-        yield f"{name}: {before} -> {after}"
+    made, made_now = (
+        dict(dotted(msgspec.to_builtins(one))) for one in (original.provenance(), here)
+    )
+    for name in sorted((made.keys() | made_now.keys()) - _NOT_COMPARED):
+        if made.get(name) != made_now.get(name):
+            before, after = (for_line(str(of.get(name)), _MAX_VALUE) for of in (made, made_now))
+            yield f"{name}: {before} -> {after}"
 
 
 def _provide(variant_id: str, conf: Conf, store: Store) -> None:

@@ -20,18 +20,22 @@ import re
 import sys
 import time
 from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
+from hydra.core.config_loader import ConfigLoader
 from hydra.core.plugins import Plugins
+from hydra.core.utils import JobReturn
 from hydra.errors import CompactHydraException
-from hydra.types import HydraContext
-from omegaconf import OmegaConf, flag_override
+from hydra.types import HydraContext, TaskFunction
+from omegaconf import DictConfig, OmegaConf, flag_override
 from omegaconf.errors import OmegaConfBaseException
 
 from xrgs.composing import escape_interpolations, to_conf
+from xrgs.config import Conf
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.evaluation.lpips import weights
 from xrgs.photos import scenes
@@ -45,10 +49,9 @@ from xrgs.safeio.sanitize import counted, for_line
 from xrgs.splat.backend import resolve_backend
 from xrgs.store.attempts import plan_cell
 from xrgs.store.store import Store, StoreGoneError
-from xrgs.sweep import controls, launchers, track
+from xrgs.sweep import launchers, track
 from xrgs.sweep import plan as plans
 from xrgs.sweep.axes import CellSpec, effective, expand
-from xrgs.sweep.ending import ending
 from xrgs.sweep.estimate import CostEstimator
 from xrgs.sweep.job import (
     FAIL_FAST,
@@ -57,21 +60,12 @@ from xrgs.sweep.job import (
     NOTHING_LOST,
     STOPPED,
     UNWRITABLE,
+    SweepSession,
     unwritable,
 )
 from xrgs.sweep.monitor import SweepMonitor
 from xrgs.sweep.plan import PlannedCell
-from xrgs.sweep.session import SweepSession
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-
-    from hydra.core.config_loader import ConfigLoader
-    from hydra.core.utils import JobReturn
-    from hydra.types import TaskFunction
-    from omegaconf import DictConfig
-
-    from xrgs.config import Conf
+from xrgs.sweep.status import ending
 
 #: An override that sets a key to a number.
 _NUMBER = re.compile(r"([\w.]+)=((?:0|[1-9]\d*)(?:\.\d+)?)")
@@ -152,7 +146,7 @@ class Study:
         plan = plans.estimated(plan, past, capacity.threads(len(plan), machine) or machine)
         if not self._brief:
             say(plans.describe(plan), sys.stderr)
-            remarks = (*controls.mixed_prune_rules(plan), *plans.unchanged(plan))
+            remarks = (*plans.mixed_prune_rules(plan), *plans.unchanged(plan))
             use = plans.expected_use(plan, past.known)
             for line in filter(None, (*remarks, plans.without_kernels(plan), use)):
                 log_line(line)
@@ -224,10 +218,10 @@ class Study:
             cell = plans.planned(spec, self._compose(spec))
             if cell.reference is not None:
                 reference = plans.planned(cell.reference, self._compose(cell.reference))
-                controls.check_reference(cell, reference)
+                plans.check_reference(cell, reference)
                 plan.setdefault(cell.reference, reference)
             plan.setdefault(cell.spec, cell)
-        controls.check_effect(combinations, plan.values())
+        plans.check_effect(combinations, plan.values())
         scenes.check_labels(cell.conf.scene for cell in plan.values())
         return plans.with_wanted_baselines(list(plan.values()))
 
@@ -326,12 +320,9 @@ class Launches:
     def launch(self, cells: Iterable[PlannedCell], store: Store) -> dict[str, str]:
         """Launch cells that have an identity, the longest first, and wait for them.
 
-        Returns:
-            The outcome of each cell's job by the cell's id: what `run_job` returned, `LOST` if the
-            cell may be launched again, or the cell's state after its last loss.
-
-        Raises:
-            XrgsError: The launcher can't be used, or begins no job; or the store is gone.
+        The outcome of each cell's job, by the cell's id, is what `run_job` returned, `LOST` if the
+        cell may be launched again, or the cell's state after its last loss. XrgsError says that the
+        launcher can't be used, or begins no job, or that the store is gone.
         """
         self._session = session = self._session or self._begin(store)
         cells = sorted(cells, key=plans.expected_length, reverse=True)

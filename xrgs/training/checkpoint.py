@@ -141,7 +141,7 @@ class Checkpoint:
 
 
 def _save(file: Path, state: State) -> None:
-    arrays: dict[str, NDArray[Any]] = {}
+    arrays: dict[str, Any] = {}
     text = json.dumps(_split_off_tensors(state, "", arrays))
     arrays[_JSON_MEMBER] = np.frombuffer(text.encode(), np.uint8)
     with atomic_writer(file) as stream:

@@ -6,7 +6,9 @@ the first test view, equals the scored render.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,16 +23,10 @@ from xrgs.safeio.files import list_names
 from xrgs.safeio.sanitize import counted
 from xrgs.splat.cameras import Camera
 from xrgs.splat.rendering import rasterize
-from xrgs.viewer.models import reference
+from xrgs.viewer.models import Model, reference
 from xrgs.viewer.paths import PATHS, default_path
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
-    from pathlib import Path
-
-    from xrgs.viewer.models import Model
-
-    Frame = NDArray[np.uint8]  # [H, W, 3]
+Frame = NDArray[np.uint8]  # [H, W, 3]
 
 _MP4 = ".mp4"
 #: Smallest and largest side of a panel, px, and the most frames of a film.
@@ -53,22 +49,10 @@ def make_film(
     size: tuple[int, int] | None = None,
     fps: int = 30,
 ) -> str:
-    """Render models along a path through the scene.
+    """Render models of one world side by side along a path, into an .mp4 file or a folder of PNGs.
 
-    The path is fitted to the cameras of the first model that has any.
-
-    Args:
-        models: One model, or several of one world, which are shown side by side with their names.
-        out: An .mp4 file, which is replaced, or a new or empty folder for PNGs, one for each frame.
-        path: A name in `xrgs.viewer.paths.PATHS`; None for `orbit`, or for `training` if an orbit
-            would leave the space that the training cameras see.
-        views: Number of frames. All have the intrinsics of the first test view.
-        size: Width and height of one model's panel, px, both even; None for the size of the first
-            test view, cut to even numbers.
-        fps: Frames per second of a film.
-
-    Returns:
-        A line for the terminal: the file, the number and size of the frames, the path.
+    The arguments are those of `xrgs-render`, whose help explains them. The path is fitted to the
+    cameras of the first model that has any. A line for the terminal is returned.
 
     Raises:
         XrgsError: An argument is out of its range, no model has cameras, PyAV is missing, or `out`

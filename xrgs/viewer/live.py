@@ -2,7 +2,8 @@
 
 Each model has its own viser server, since a page of viser shows one scene. If the user moves the
 camera of a frame, those of the other frames follow. All servers listen only on the loopback
-interface.
+interface. A browser sorts and blends all Gaussians itself, which is slow for more than some hundred
+thousand, so that the least opaque ones can be left out.
 """
 
 from __future__ import annotations
@@ -12,26 +13,28 @@ import io
 import math
 import threading
 from collections import deque
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, redirect_stdout
+from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
+from numpy.typing import NDArray
 
 from xrgs.errors import XrgsError
 from xrgs.safeio.sanitize import for_markdown
-from xrgs.store.contact_sheet import COLOURS
-from xrgs.viewer.models import reference
+from xrgs.splat.cameras import Camera
+from xrgs.splat.gaussians import Gaussians
+from xrgs.splat.quaternions import rotation_matrices
+from xrgs.splat.sh import sh_to_colors
+from xrgs.store.inspect import COLOURS
+from xrgs.viewer.models import Model, reference
 from xrgs.viewer.paths import look_at_point, up_direction
-from xrgs.viewer.splats import to_splats
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
     from viser import CameraHandle, ClientHandle, ViserServer
-
-    from xrgs.splat.cameras import Camera
-    from xrgs.viewer.models import Model
 
     _Pose = dict[str, Any]  # by the names of _POSE
 
@@ -69,21 +72,18 @@ _POLICY = f"default-src 'none'; style-src 'unsafe-inline'; frame-src http://{HOS
 
 @contextmanager
 def shown(models: Sequence[Model], port: int, limit: int) -> Iterator[str]:
-    """Show models while a `with` block runs.
+    """Show models of one world while a `with` block runs; yield the address of the page.
 
-    Args:
-        models: One model, or several of one world.
-        port: The port of the page; viser's servers take the next free ones. 0 lets the system
-            choose all of them.
-        limit: The most Gaussians of a model that are drawn, see `xrgs.viewer.splats.to_splats`.
-
-    Yields:
-        The address of the page.
+    viser's servers take the next ports after that of the page, which is `port`; 0 lets the system
+    choose all of them. At most `limit` Gaussians of a model are drawn.
 
     Raises:
         XrgsError: viser is missing, or the port can't be used.
     """
-    viser = _viser()
+    try:
+        import viser
+    except ImportError as error:
+        raise XrgsError("the live viewer needs viser: pip install 'xrgs[view]'") from error
     with ExitStack() as stack:
         page = _PageServer(port)
         stack.callback(page.server_close)
@@ -119,14 +119,6 @@ def _without_banners() -> Iterator[None]:
     """Hide viser's output: it prints the addresses of single frames, which nobody should open."""
     with redirect_stdout(io.StringIO()):
         yield
-
-
-def _viser() -> Any:
-    try:
-        import viser
-    except ImportError as error:
-        raise XrgsError("the live viewer needs viser: pip install 'xrgs[view]'") from error
-    return viser
 
 
 class _PageServer(ThreadingHTTPServer):
@@ -296,3 +288,37 @@ def _same(first: _Pose, second: _Pose) -> bool:
     """Return whether two poses differ at most by the browser's rounding."""
     near = _ROUNDING * np.linalg.norm(np.subtract(first["position"], first["look_at"]))
     return all(np.allclose(first[name], second[name], rtol=0, atol=near) for name in _POSE)
+
+
+Array = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Splats:
+    """N Gaussians without harmonics above band 0, in the order of the model."""
+
+    centers: Array
+    """[N, 3] world units."""
+    covariances: Array
+    """[N, 3, 3] world units squared."""
+    colors: Array
+    """[N, 3] in 0..1."""
+    opacities: Array
+    """[N] in 0..1."""
+
+
+@torch.no_grad()
+def to_splats(gaussians: Gaussians, limit: int) -> Splats:
+    """Convert the `limit` most opaque Gaussians of a model; of equal ones, the first are taken."""
+    kept = gaussians.opacities.argsort(descending=True, stable=True)[:limit].sort().values
+    rotations, scales = rotation_matrices(gaussians.quats[kept]), gaussians.scales[kept].exp()
+    factor = rotations * scales[:, None, :]  # [N, 3, 3], each axis times its length
+    means, sh0 = gaussians.means[kept], gaussians.sh0[kept]
+    any_direction = torch.zeros_like(means)
+    arrays = (
+        means,
+        factor @ factor.transpose(1, 2),
+        sh_to_colors(0, any_direction, sh0, gaussians.shN[kept]).clamp(0, 1),
+        gaussians.opacities[kept].sigmoid(),
+    )
+    return Splats(*(array.numpy() for array in arrays))

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,16 +12,12 @@ from xrgs.errors import StoreError, XrgsError
 from xrgs.formats.files import READERS, load_gaussians
 from xrgs.safeio.paths import user_path
 from xrgs.safeio.sanitize import for_line
+from xrgs.splat.cameras import Camera
+from xrgs.splat.gaussians import Gaussians
 from xrgs.splat.settings import RasterSettings
+from xrgs.store.cell_folder import CellFolder
+from xrgs.store.store import Store
 from xrgs.viewer.paths import Poses
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from xrgs.splat.cameras import Camera
-    from xrgs.splat.gaussians import Gaussians
-    from xrgs.store.cell_folder import CellFolder
-    from xrgs.store.store import Store
 
 _log = logging.getLogger(__name__)
 
@@ -60,17 +56,10 @@ class Model:
 
 
 def load_models(words: Sequence[str], store: Store, antialiased: bool | None = None) -> list[Model]:
-    """Load one model, or two of one world.
+    """Load one model, or two of one world, each a cell as of `Store.find_cell` or a file.
 
-    Args:
-        words: The cells, each as `Store.find_cell` takes it, or as the path of a .ply, .glb or
-            .spz file.
-        store: The store that has the cells.
-        antialiased: Whether to render antialiased; None renders each as it was trained. A warning
-            names a model that was trained otherwise.
-
-    Returns:
-        The models, in the order of the words.
+    `antialiased` says whether to render antialiased; None renders each as it was trained. A warning
+    names a model that was trained otherwise.
 
     Raises:
         XrgsError: There are no words or too many, a word names no finished cell, a file is damaged,

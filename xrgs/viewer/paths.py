@@ -1,13 +1,14 @@
 """Paths of cameras through a scene, fitted to the cameras of its photographs.
 
 All computations are in float64, in the normalised world of `xrgs.splat.normalize`. Its unit is the
-median distance of the cameras from the point that they look at. Cameras have OpenCV axes.
+median distance of the cameras from the point that they look at. Cameras have OpenCV axes. A path is
+[views, 4, 4], world to camera.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +17,6 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from xrgs.errors import XrgsError
 from xrgs.splat.normalize import camera_positions
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 Array = NDArray[np.float64]
 
@@ -60,10 +58,7 @@ def orbit(poses: Poses, views: int) -> Array:
     The circle is level, at the median height and the median distance of the cameras. If they
     surround the point, the circle is closed. If they leave a gap of more than 90 degrees, as in a
     forward-facing scene, the path swings to and fro over their arc, since the scene was not
-    photographed from elsewhere.
-
-    Returns:
-        [views, 4, 4] world to camera. The path can be repeated without a jump.
+    photographed from elsewhere. The path can be repeated without a jump.
     """
     focus, up = look_at_point(poses), up_direction(poses)
     first = _perpendicular(up)
@@ -85,16 +80,11 @@ def orbit(poses: Poses, views: int) -> Array:
 def spiral(poses: Poses, views: int) -> Array:
     """Move on LLFF's spiral around the mean training camera, and look at one point.
 
-    As `render_path_spiral` of [mildenhall2019], it makes two turns. Their radii along the axes of
-    the mean camera are the 90th percentiles of the cameras' offsets. All cameras look at one point
-    on the mean camera's axis, at the harmonic mean of 0.9 times the nearest and 5 times the
-    farthest depth of the points, with weights 1/4 and 3/4.
-
-    Returns:
-        [views, 4, 4] world to camera. The path can be repeated without a jump.
-
-    Raises:
-        XrgsError: The cameras don't face one way.
+    As `render_path_spiral` of [mildenhall2019], it makes two turns, and can be repeated without a
+    jump. Their radii along the axes of the mean camera are the 90th percentiles of the cameras'
+    offsets. All cameras look at one point on the mean camera's axis, at the harmonic mean of 0.9
+    times the nearest and 5 times the farthest depth of the points, with weights 1/4 and 3/4.
+    XrgsError says that the cameras don't face one way.
     """
     directions = poses.train[:, 2, :3]
     forward = directions.mean(axis=0)
@@ -121,9 +111,6 @@ def through_test_views(poses: Poses, views: int) -> Array:
 
     Positions are interpolated by cubic Hermite polynomials that don't overshoot (PCHIP), rotations
     at constant angular velocity. The first camera is the first test view, the last one the last.
-
-    Returns:
-        [views, 4, 4] world to camera.
     """
     return _through(poses.test, views)
 
@@ -133,9 +120,6 @@ def through_training_views(poses: Poses, views: int) -> Array:
 
     It passes through evenly chosen cameras, one for every ten frames: through all of many cameras
     it would shake. In between it is interpolated as in `through_test_views`.
-
-    Returns:
-        [views, 4, 4] world to camera.
     """
     last = len(poses.train) - 1
     count = min(last + 1, max(2, 1 + views // _FRAMES_BETWEEN))

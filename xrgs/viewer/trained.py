@@ -6,30 +6,27 @@ torch: they call this module only for pages with pictures, and get plain numbers
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from xrgs.errors import XrgsError
+from xrgs.mixture.views import Variant
 from xrgs.splat.backend import resolve_backend
+from xrgs.splat.cameras import Camera
+from xrgs.splat.gaussians import ActivatedGaussians, Gaussians
 from xrgs.splat.rendering import attribute_pixels, rasterize
+from xrgs.splat.settings import RasterSettings
 from xrgs.splat.sh import C0
+from xrgs.store.cell_folder import CellFolder
 from xrgs.training import dataset
+from xrgs.training.dataset import Dataset, LoadedView
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-
-    from xrgs.mixture.views import Variant
-    from xrgs.splat.cameras import Camera
-    from xrgs.splat.gaussians import ActivatedGaussians, Gaussians
-    from xrgs.splat.settings import RasterSettings
-    from xrgs.store.cell_folder import CellFolder
-    from xrgs.training.dataset import Dataset, LoadedView
-
-    Image = NDArray[np.float32]  # [H, W, 3] 0..1
+Image = NDArray[np.float32]  # [H, W, 3] 0..1
 
 #: The number of shown training views of each tag.
 SHOWN_OF_A_TAG = 2
@@ -81,21 +78,13 @@ class TrainedScene:
     """Cells of one variant: its cameras, and the cells' renders and models."""
 
     def __init__(self, variant: Variant) -> None:
-        """Load the photographs and cameras.
-
-        Raises:
-            XrgsError: The variant's images can't be read.
-        """
+        """Load the photographs and cameras."""
         self._data = dataset.load(variant, "mixed")
         self._originals = _originals(variant)
         self._models: dict[str, _Model] = {}
 
     def add(self, cell: CellFolder) -> None:
-        """Load the Gaussians of a cell.
-
-        Raises:
-            XrgsError: The Gaussians can't be read, or are not finite; the message says why.
-        """
+        """Load the Gaussians of a cell; XrgsError if they can't be read, or are not finite."""
         try:
             raster, gaussians = cell.config().splat.raster, cell.gaussians()
         except OSError as error:
@@ -195,18 +184,12 @@ class _Model:
 
 
 def quantise(gaussians: ActivatedGaussians, kept: torch.Tensor) -> bytes:
-    """Quantise Gaussians for the page's viewer; `splats.js` undoes it.
+    """Quantise some of N Gaussians, by their indices [M], for the page's viewer (`splats.js`).
 
     A coordinate x is stored as x / (1 + |x|): the resolution is 3e-5 at the centre of the
-    normalised world, and any distance fits. Only band 0 of the harmonics is kept.
-
-    Args:
-        gaussians: N Gaussians.
-        kept: [M] indices of those to keep.
-
-    Returns:
-        First the means, M times three little-endian uint16. Then M times 11 uint8: three scales
-        (their logarithms over `LOG_SCALES`), the quaternion (-1..1), the colour, the opacity.
+    normalised world, and any distance fits. Only band 0 of the harmonics is kept. First come the
+    means, M times three little-endian uint16. Then M times 11 uint8: three scales (their logarithms
+    over `LOG_SCALES`), the quaternion (-1..1), the colour, the opacity.
     """
     means, quats, scales, opacities, sh0 = (
         value.detach()[kept].numpy().astype(np.float64) for value in gaussians[:5]

@@ -17,7 +17,7 @@ from tests.mixture.poses.written import POINTS, SIZE, to_world, write_colmap, wr
 from xrgs.errors import XrgsError
 from xrgs.mixture import poses
 from xrgs.mixture.photographs import PhotoCollection
-from xrgs.mixture.sfm import Reconstruction
+from xrgs.mixture.views import Reconstruction
 from xrgs.splat.normalize import normalize_scene
 
 SHIFTS = [(0, 0, 0), (500_000, 4_600_000, 120), (1e7, -1e7, 1e7)]

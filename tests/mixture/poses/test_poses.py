@@ -22,7 +22,7 @@ from tests.mixture.poses.written import (
 from xrgs.errors import XrgsError
 from xrgs.mixture import poses
 from xrgs.mixture.photographs import PhotoCollection
-from xrgs.mixture.sfm import Reconstruction
+from xrgs.mixture.views import Reconstruction
 from xrgs.photos.scenes import Scene
 
 

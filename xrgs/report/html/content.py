@@ -3,29 +3,22 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pandas as pd
 
 from xrgs.errors import StoreError
 from xrgs.evaluation.metrics import METRICS, VIEW_METRICS
-from xrgs.report.collect import CURVE_COLUMNS, number_columns
+from xrgs.mixture.views import Variant
+from xrgs.report.collect import CURVE_COLUMNS, ReportStore, Sweep
+from xrgs.report.compare import Comparison
+from xrgs.report.context import Context
 from xrgs.report.markup import titled
 from xrgs.report.writing import by_key, number, verdict, with_unit
 from xrgs.safeio.sanitize import MAX_CELL, counted, for_line
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
-    from pathlib import Path
-
-    from xrgs.evaluation.metrics import Metric
-    from xrgs.mixture.views import Variant
-    from xrgs.report.collect import Sweep
-    from xrgs.report.compare import Comparison
-    from xrgs.report.context import Context
-    from xrgs.report.joined import ReportStore
-    from xrgs.report.writing import Change
+from xrgs.store.cell_folder import number_columns
 
 #: The keys of a run. The page shows the cells of a run, one for each label, side by side.
 RUN = ["scene", "condition", "variant_seed", "seed"]
@@ -87,10 +80,8 @@ def run_names(row: Mapping[str, Any] | pd.Series) -> dict[str, str]:
 def runs(comparison: Comparison) -> Iterator[pd.DataFrame]:
     """Yield the finished cells of each scene, condition and replicate, the base first.
 
-    The first replicates of all scenes and conditions come before the second ones.
-
-    Yields:
-        Rows of `Comparison.cells`, one for each label.
+    They are rows of `Comparison.cells`, one for each label. The first replicates of all scenes and
+    conditions come before the second ones.
     """
     cells = comparison.cells
     done = cells[cells["state"] == "done"].drop_duplicates([*RUN, "label"])
@@ -132,21 +123,17 @@ def add_history(content: Content, store: ReportStore, comparison: Comparison) ->
     for rows in runs(comparison):
         for _, row in rows[~rows["cell_id"].isin(store.external)].iterrows():
             try:
-                columns = _history(store.cell(row["cell_id"]).path / "history.csv")
+                history = number_columns(store.cell(row["cell_id"]).path / "history.csv")
             except StoreError as error:
                 label = f"{shown(row['scene'])}, {shown(row['label'])}"
                 content.notes.append(f"{label}: no history, {why(error, store)}")
                 continue
+            count = len(history["step"])
+            step = max(1, -(-count // _MAX_ROWS))
+            kept = [*range(0, count, step)] + [count - 1] * ((count - 1) % step > 0)
+            names = [name for name in ("step", *RULES) if name in history]
+            columns = {name: [finite(history[name][at]) for at in kept] for name in names}
             content.history.append(run_names(row) | {"label": shown(row["label"])} | columns)
-
-
-def _history(file: Path) -> dict[str, list[float | None]]:
-    columns = number_columns(file)
-    count = len(columns["step"])
-    step = max(1, -(-count // _MAX_ROWS))
-    kept = [*range(0, count, step)] + [count - 1] * ((count - 1) % step > 0)
-    names = [name for name in ("step", *RULES) if name in columns]
-    return {name: [finite(columns[name][at]) for at in kept] for name in names}
 
 
 def add_trade_offs(content: Content, comparison: Comparison) -> None:
@@ -187,25 +174,14 @@ _MADE_WITH = {
 }
 
 
-@dataclass(frozen=True)
-class Answer:
-    """The changes of one ablation, by their verdicts."""
+def answers(comparison: Comparison) -> list[dict[str, Any]]:
+    """Return the verdicts on each ablation, in the order of the tables.
 
-    label: str
-    condition: str
-    pairs: str
-    """The number of scenes and pairs, as a phrase."""
-    better: tuple[str, ...]
-    """The outcomes that are shown to be better, with their change."""
-    worse: tuple[str, ...]
-    undecided: tuple[tuple[str, tuple[str, ...]], ...]
-    """Verdict -> the metrics with it and their changes, for all other verdicts."""
-
-
-def answers(comparison: Comparison) -> list[Answer]:
-    """Return the verdicts on each ablation, in the order of the tables."""
+    Each has its label, condition and number of pairs, the outcomes that are shown to be `better` or
+    `worse` with their changes, and in `undecided` the metrics of each other verdict.
+    """
     means = by_key(comparison.means)
-    result = []
+    result: list[dict[str, Any]] = []
     for label, condition in comparison.groups:
         rows = [
             (metric, means[label, condition, metric.name])
@@ -214,27 +190,22 @@ def answers(comparison: Comparison) -> list[Answer]:
         ]
         verdicts: dict[str, list[str]] = {}
         for metric, row in rows:
-            verdicts.setdefault(shown(verdict(row, metric)), []).append(_change(metric, row))
-        better, worse = (tuple(verdicts.pop(verdict, ())) for verdict in ("better", "worse"))
+            change = "" if math.isnan(row.change) else f" {with_unit(row.change, metric)}"
+            text = f"{metric.label}{change}"
+            verdicts.setdefault(shown(verdict(row, metric)), []).append(text)
         scenes = max((row.scenes for _, row in rows), default=0)
         pairs = max((row.pairs for _, row in rows), default=0)
         result.append(
-            Answer(
-                label=shown(label),
-                condition=shown(condition),
-                pairs=f"{counted(scenes, 'scene')}, {counted(pairs, 'pair')} of cells",
-                better=better,
-                worse=worse,
-                undecided=tuple((why, tuple(texts)) for why, texts in verdicts.items()),
-            )
+            {
+                "label": shown(label),
+                "condition": shown(condition),
+                "pairs": f"{counted(scenes, 'scene')}, {counted(pairs, 'pair')} of cells",
+                "better": verdicts.pop("better", []),
+                "worse": verdicts.pop("worse", []),
+                "undecided": verdicts.items(),
+            }
         )
     return result
-
-
-def _change(metric: Metric, row: Change) -> str:
-    if math.isnan(row.change):
-        return metric.label
-    return f"{metric.label} {with_unit(row.change, metric)}"
 
 
 def page_context(

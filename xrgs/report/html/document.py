@@ -8,16 +8,21 @@ from __future__ import annotations
 
 import base64
 import hashlib
+from collections.abc import Iterator, Sequence
 from functools import cache
 from importlib import resources
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import pandas as pd
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
 from xrgs.errors import XrgsError
 from xrgs.evaluation.metrics import METRICS, VIEW_METRICS
 from xrgs.mixture import variant
+from xrgs.mixture.views import Variant
+from xrgs.report.collect import ReportStore, Sweep
+from xrgs.report.context import photographs, placement
 from xrgs.report.html.content import (
     Content,
     add_curves,
@@ -33,22 +38,11 @@ from xrgs.report.html.content import (
 from xrgs.report.html.images import ERROR_RANGE, add_trained, add_views
 from xrgs.report.markup import filled, filled_places, titled, to_latex, to_markdown
 from xrgs.report.paper import counterparts
-from xrgs.report.photographs import photographs, placement
+from xrgs.report.tables import Tables
 from xrgs.report.writing import NO_INTERVAL, number, signed, with_unit
 from xrgs.runtime.text import TextTable, listed
 from xrgs.safeio.atomic import write_text
 from xrgs.safeio.sanitize import for_csv, for_line
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from pathlib import Path
-
-    from jinja2 import Template
-
-    from xrgs.mixture.views import Variant
-    from xrgs.report.collect import Sweep
-    from xrgs.report.joined import ReportStore
-    from xrgs.report.tables import Tables
 
 #: The largest page, bytes, and its parts for test views, training views and models.
 MAX_BYTES = 10_000_000
@@ -133,7 +127,14 @@ def _fitting(
     """Return the page; parts are left out until it has at most `MAX_BYTES`."""
     changes = [*_changes(long, tables.comparison.scenes)]
     kept = filled_places([_texts(row) for row in changes])
-    listed = filled(_changes_table(changes, head["base"]))
+    listed = filled(
+        TextTable(
+            f"Changes from {head['base']}",
+            tuple(name.format(base=head["base"]) for name in _CHANGE_COLUMNS),
+            tuple(map(_texts, changes)),
+            "".join(_CHANGE_COLUMNS.values()),
+        )
+    )
     labels = [shown(label) for label, _ in tables.comparison.groups]
     style, script = _source("page.css"), "\n".join(map(_source, _SCRIPTS))
     copies = [_copies(table) for table in texts]
@@ -154,7 +155,7 @@ def _fitting(
                 "base": head["base"],
                 "copies": copies,
                 "changes": _lines(listed),
-                "scores": [_score(name) for name in VIEW_METRICS if _is_measured(content, name)],
+                "scores": _scores(content),
             },
         )
         if len(text.encode()) <= MAX_BYTES or not part:
@@ -208,16 +209,18 @@ def _policy(style: str, script: str) -> str:
     )
 
 
-def _is_measured(content: Content, name: str) -> bool:
-    """Return whether any view has a score; LPIPS is missing without its weights."""
-    arms = (arm for entry in content.views for arm in entry["arms"])
-    return any(arm["scores"][name] is not None for arm in arms)
-
-
-def _score(name: str) -> dict[str, Any]:
-    metric = next(metric for metric in METRICS if metric.name == name)
-    label = f"{metric.label}{metric.unit and f', {metric.unit}'}"
-    return {"name": name, "label": label, "higher": metric.higher_is_better}
+def _scores(content: Content) -> list[dict[str, Any]]:
+    """Return the scores that any view has; LPIPS is missing without its weights."""
+    of_views = [arm["scores"] for entry in content.views for arm in entry["arms"]]
+    return [
+        {
+            "name": metric.name,
+            "label": f"{metric.label}{metric.unit and f', {metric.unit}'}",
+            "higher": metric.higher_is_better,
+        }
+        for metric in METRICS
+        if metric.name in VIEW_METRICS and any(of[metric.name] is not None for of in of_views)
+    ]
 
 
 def _copies(table: TextTable) -> dict[str, str]:
@@ -247,13 +250,6 @@ _CHANGE_COLUMNS = {
     "Ablation": "l", "Scene": "l", "Metric": "l", "Change": "r", "Verdict": "l", "{base}": "r",
     "Value": "r", "From": "r", "To": "r", "q": "r", "Same sign": "l",
 }  # fmt: skip
-
-
-def _changes_table(rows: Sequence[dict[str, Any]], base: str) -> TextTable:
-    """Return the table of all changes, from the rows of `_changes`."""
-    columns = tuple(name.format(base=base) for name in _CHANGE_COLUMNS)
-    texts = tuple(map(_texts, rows))
-    return TextTable(f"Changes from {base}", columns, texts, "".join(_CHANGE_COLUMNS.values()))
 
 
 def _texts(row: dict[str, Any]) -> tuple[str, ...]:

@@ -8,32 +8,29 @@ from __future__ import annotations
 import base64
 import io
 import math
+from collections.abc import Sequence
 from itertools import islice
+from pathlib import Path
 from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 from matplotlib import colormaps
+from numpy.typing import NDArray
 from PIL import Image
 
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.evaluation.metrics import VIEW_METRICS
+from xrgs.mixture.views import Variant
 from xrgs.photos import images
 from xrgs.photos.images import ImageError
-from xrgs.report.html.content import finite, run_names, runs, shown, why
+from xrgs.report.collect import ReportStore
+from xrgs.report.compare import Comparison
+from xrgs.report.html.content import Content, finite, run_names, runs, shown, why
 from xrgs.runtime.progress import progress
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    import pandas as pd
-    from numpy.typing import NDArray
-
-    from xrgs.mixture.views import Variant
-    from xrgs.report.compare import Comparison
-    from xrgs.report.html.content import Content
-    from xrgs.report.joined import ReportStore
     from xrgs.viewer.trained import TrainedScene
 
 #: The largest longer side of an image on the page, px.
@@ -61,12 +58,10 @@ _MAX_KEPT, _MIN_KEPT = 100_000, 8_000
 
 
 class Album:
-    """Adds images to those of a page, each image once.
+    """Adds images to those of a page (`urls`, as data URLs), each image once.
 
-    Args:
-        urls: The images of the page, as data URLs; new ones are appended.
-        max_bytes: The most bytes of all added data URLs.
-        pixels: The expected number of added pixels, which decides the quality.
+    All added data URLs have at most `max_bytes`. The expected number of added `pixels` decides the
+    quality.
     """
 
     def __init__(self, urls: list[str], max_bytes: int, pixels: int) -> None:
@@ -77,11 +72,9 @@ class Album:
         self._quality = next(fitting, _QUALITIES[-1][0])
 
     def add(self, images: Sequence[Image.Image]) -> list[int] | None:
-        """Add RGB images that belong together.
+        """Add RGB images that belong together; return the index of each in the page's images.
 
-        Returns:
-            The index of each in the page's images. If they do not fit, none is added, and the
-            result is None.
+        If they do not fit, none is added, and the result is None.
         """
         urls = [data_url(image, self._quality) for image in images]
         new = dict.fromkeys(url for url in urls if url not in self._numbers)
@@ -114,14 +107,10 @@ def to_image(array: NDArray[np.float32]) -> Image.Image:
 
 
 def error_map(photograph: Image.Image, render: Image.Image) -> Image.Image:
-    """Draw the difference of a render from its photograph, RGB images of one size.
+    """Draw the difference of a render from its photograph, RGB images of one size; else ValueError.
 
-    Returns:
-        The mean absolute difference of the channels, from black at 0 to pale yellow at
-        `ERROR_RANGE` (matplotlib's magma), at half the size.
-
-    Raises:
-        ValueError: The sizes differ.
+    It is the mean absolute difference of the channels, from black at 0 to pale yellow at
+    `ERROR_RANGE` (matplotlib's magma), at half the size.
     """
     if photograph.size != render.size:
         raise ValueError("photograph and render differ in size")

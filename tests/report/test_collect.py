@@ -9,8 +9,7 @@ import msgspec
 import pytest
 
 from xrgs.report import Choice, build
-from xrgs.report.collect import ReportError
-from xrgs.report.joined import report_name
+from xrgs.report.collect import ReportError, report_name
 from xrgs.safeio.records import read_table
 from xrgs.store.attempts import remove_cell
 from xrgs.store.store import Store
