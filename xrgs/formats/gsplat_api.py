@@ -7,9 +7,7 @@ instead. Unsupported arguments raise an error that names them.
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable
-from functools import wraps
-from typing import Any, Literal, NamedTuple, ParamSpec, TypeVar, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor
@@ -23,9 +21,6 @@ from xrgs.splat.sh import C0, MAX_DEGREE, bases
 from xrgs.splat.torch.projection import depths as camera_depths
 from xrgs.splat.torch.projection import project
 from xrgs.splat.torch_defaults import on_cpu_in_float32
-
-_P = ParamSpec("_P")
-_R = TypeVar("_R")
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 RasterizeMode = Literal["classic", "antialiased"]
@@ -58,22 +53,6 @@ class _Projections(NamedTuple):
     opacities: Tensor  # [C, N], compensated if antialiased
 
 
-def _without_autocast(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """Decorate a function to compute in the types of its arguments inside `torch.autocast` too.
-
-    Autocast rounds the operands of matrix products to bfloat16: projections would be some px off.
-    gsplat's kernels don't see it.
-    """
-
-    @wraps(function)
-    def run(*args: _P.args, **kwargs: _P.kwargs) -> _R:
-        with torch.autocast("cpu", enabled=False):
-            return function(*args, **kwargs)
-
-    return run
-
-
-@_without_autocast
 @on_cpu_in_float32
 def rasterization(
     means: Tensor,

@@ -78,7 +78,7 @@ class RasterSettings:
         0.3
     """
 
-    sh_degree: int = 3
+    sh_degree: int = field(default=3, metadata={"least": 0, "most": 3})
     """Highest band of the spherical harmonics, 0 to 3."""
     near: float = 0.01
     """Gaussians at this depth or nearer are not rendered, world units along z."""

@@ -115,5 +115,6 @@ def _member(file: Path, name: str) -> bytes | None:
                     stream = archive.extractfile(member)
                     return stream.read(_MAX_BYTES) if stream else b""
     except (OSError, EOFError, zlib.error, tarfile.TarError) as error:
-        raise XrgsError(f"{file}: can't be read ({error})") from error
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise XrgsError(f"{file}: can't be read ({reason})") from error
     raise XrgsError(f"{file}: there is no {name} in it")
