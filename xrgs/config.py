@@ -255,7 +255,7 @@ class NaturalSelectionConf:
     """Removal of Gaussians that fade under a constant opacity gradient (GNS); not in the paper."""
 
     budget: float = amount(off=0.0)
-    until: int
+    until: int = limited(least=1)
     drop_every: int = off(50, least=1)
 
 
