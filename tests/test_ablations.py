@@ -97,6 +97,7 @@ def test_each_value_of_a_sweep_file_makes_a_config(file: Path, composed: Compose
                 composed(*spec.overrides)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("names", "whole"),
     [

@@ -163,6 +163,7 @@ def test_a_plugin_without_source_is_refused(install: Install) -> None:
             plugins.code_digest(name, identity.CODE)
 
 
+@pytest.mark.slow
 def test_the_identity_has_the_source_and_imports_none_of_it(
     install: Install, baseline: Conf
 ) -> None:

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 
-from xrgs.config import CONF_DIR, PATHS, Conf, known_keys, types_of
+from xrgs.config import CONF_DIR, PATHS, ComponentsConf, Conf, is_on, known_keys, types_of
 from xrgs.errors import XrgsError, did_you_mean
 from xrgs.safeio.paths import user_path
 from xrgs.safeio.records import read_struct
@@ -136,11 +136,14 @@ def _value(conf: Conf, key: str) -> Any:
 
 
 def _check_limits(group: Any, path: str = "") -> None:
-    """Raise `XrgsError` for a value outside its limits, on or off; the message names its key."""
+    """Raise `XrgsError` for a value outside its limits; the message names its key.
+
+    A component that is off is left out: its keys may depend on others, as on `splat.densify.stop`.
+    """
     for message in outside_limits(group, path):
         raise XrgsError(message)
     for name, inner in vars(group).items():
-        if is_dataclass(inner):
+        if is_dataclass(inner) and (is_on(inner) or not isinstance(group, ComponentsConf)):
             _check_limits(inner, f"{path}{name}.")
 
 

@@ -76,6 +76,7 @@ def test_what_is_no_npz_is_refused(tmp_path: Path) -> None:
             loads.read(tmp_path / "bad.npz")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [300, 3000])
 def test_random_loads_put_as_many_gaussians_on_a_pixel_as_trained_ones(count: int) -> None:
     load = loads.random_load(count, 80, 60, seed=0)

@@ -58,6 +58,7 @@ def widths(axes: Axes) -> list[float]:
     return [bar.get_width() for bar in axes.patches if isinstance(bar, Rectangle)]
 
 
+@pytest.mark.slow
 def test_one_panel_answers_each_question(results: dict[str, Any]) -> None:
     backends, cutoffs, shortcuts, by_gaussians, by_pixels, steps = plot.draw_figure(results).axes
     # The largest load that torch was timed on, and one thread.

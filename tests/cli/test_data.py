@@ -49,6 +49,7 @@ def built(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     return confs
 
 
+@pytest.mark.slow
 def test_inspect_builds_a_variant_that_the_store_lacks(
     xrgs_data: XrgsData, monkeypatch: pytest.MonkeyPatch, built: list[dict[str, Any]]
 ) -> None:

@@ -23,6 +23,7 @@ RunCommand = Callable[..., tuple[int, str, str]]
 COMMANDS = ("bench", "data", "render", "report", "status", "store", "train", "view")
 
 
+@pytest.mark.slow
 def test_help_answers_at_once(tmp_path: Path, without_heavy: str) -> None:
     """All commands in one process, in which no module that takes long can be imported."""
     script = """

@@ -50,6 +50,7 @@ def test_hydra_reads_a_path_as_it_was_written(name: str) -> None:
     assert texts([f"store={name}"]).store == name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["a,b", "null", "${y}"])
 def test_a_word_that_hydra_reads_otherwise_is_a_path_if_it_exists(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compose: Callable[..., config.Conf]
@@ -92,6 +93,7 @@ def test_lists_of_names_are_lists_and_axes(value: str, lists: list[list[str]]) -
     assert found == lists
 
 
+@pytest.mark.slow
 def test_files_of_groups_may_have_any_name(tmp_path: Path, sweep_here: RunCommand) -> None:
     (tmp_path / "scene").mkdir()
     for name in ("é (1)", "a=b"):
@@ -162,6 +164,7 @@ def test_a_mistake_beside_an_axis_is_named_and_not_the_axis(
 HEAD = "# @package _global_\n"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("content", "named"),
     [
@@ -184,6 +187,7 @@ def test_a_mistake_in_a_file_of_the_users_own_is_named(
     assert re.search(re.escape(named).replace(r"\.\*", ".*"), err), err
 
 
+@pytest.mark.slow
 def test_an_axis_of_the_sweepers_own_settings_and_a_glob_are_planned(
     sweep_here: RunCommand,
 ) -> None:
@@ -200,6 +204,7 @@ def test_an_arm_that_was_moved_out_is_named_with_its_package(sweep_here: RunComm
     assert f"ablation={arm}: it is in a package of its own: pip install ./examples/arms" in err
 
 
+@pytest.mark.slow
 def test_the_home_folder_of_a_store_is_not_a_folder_called_tilde(
     sweep_here: RunCommand, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, children: object
 ) -> None:

@@ -190,6 +190,7 @@ def test_a_single_run_is_refused(sweep_here: SweepHere, children: Any) -> None:
     assert not children.trained
 
 
+@pytest.mark.slow
 def test_a_launcher_named_in_an_ablation_is_refused(sweep_here: SweepHere, tmp_path: Path) -> None:
     (tmp_path / "mine" / "ablation").mkdir(parents=True)
     for name in ("here", "there"):
@@ -211,7 +212,7 @@ def test_a_launcher_named_in_an_ablation_is_refused(sweep_here: SweepHere, tmp_p
         (["scene=folder", "scene.path=one"], ["one"]),
         (["store=in-the-way"], ["in-the-way", "store="]),
         (["rerun=gone"], ["rerun=gone", "no such folder"]),
-        (["rerun=~/gone"], [f"rerun={Path.home() / 'gone'}: no such folder"]),
+        (["rerun=~/gone"], [f"rerun={Path.home() / 'gone'}: there is no such folder"]),
         (["rerun=gone", "seed=1"], ["seed", "rerun= takes out="]),
         (["rerun=gone", "threads=x"], ["threads"]),
     ],
@@ -260,6 +261,7 @@ def test_bad_input_that_a_child_finds_is_named(
     assert "Traceback" not in err
 
 
+@pytest.mark.slow
 def test_a_dry_run_plans_without_torch_and_writes_nothing(
     run_command: RunCommand,
     tmp_path: Path,
@@ -321,6 +323,7 @@ def test_a_dry_run_fails_where_photographs_are_missing_and_says_once_how_to_get_
         assert "download" not in err
 
 
+@pytest.mark.slow
 def test_captures_are_looked_for_in_data_root(sweep_here: SweepHere) -> None:
     scenes = ("scene=captures/monstree,captures/ollie", "dry_run=true")
     code, _, err = sweep_here(*scenes, "data_root=x/y")
@@ -332,6 +335,7 @@ def test_captures_are_looked_for_in_data_root(sweep_here: SweepHere) -> None:
     assert "they belong into data/captures/monstree, data/captures/ollie\n" in err
 
 
+@pytest.mark.slow
 def test_ablations_stack_and_one_that_changes_nothing_is_named_in_the_plan(
     sweep_here: SweepHere,
 ) -> None:

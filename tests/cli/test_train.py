@@ -53,6 +53,7 @@ def garden(photographs: Callable[..., Path], tmp_path: Path) -> Path:
     return photographs(tmp_path / "garden", 9)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("garden")
 def test_the_recipe_is_for_what_the_photographs_are(
     handed_over: Callable[..., dict[str, str]],
@@ -70,6 +71,7 @@ def test_the_recipe_is_for_what_the_photographs_are(
     assert "splat.densify.every" not in words, "a long run is refined as the paper's"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
@@ -95,6 +97,7 @@ def test_options_are_overrides_and_those_of_the_user_win(
     assert expected.items() <= words.items()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("garden")
 @pytest.mark.parametrize(
     ("minutes", "more"),
@@ -227,6 +230,7 @@ def test_a_scene_is_made_and_its_last_lines_lead_on(
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
 
 
+@pytest.mark.slow
 def test_a_cell_that_fails_is_named_with_the_reason(sweep_here: RunCommand, children: Any) -> None:
     children.failures = {0: "it raised"}
     arguments = ("scene=motorcycle", "preset=smoke", "store=s", "hydra.sweeper.brief=true")

@@ -203,6 +203,7 @@ def geometry_gradients(
     return v_mean, v_scale, (v_unit - dot(v_unit, f.q)[:, None] * f.q) / length
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("width", "height", "raster"),
     [

@@ -24,6 +24,7 @@ def joined(first: Gaussians, second: Gaussians) -> Gaussians:
     return Gaussians(*(torch.cat([first[name], second[name]]).detach() for name in names))
 
 
+@pytest.mark.slow
 def test_what_is_close_to_one_camera_is_counted_and_left_out(
     script: Callable[[str], ModuleType], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -50,6 +50,7 @@ def test_splats_begin_on_the_points(script: Callable[[str], ModuleType]) -> None
         torch.testing.assert_close(of_script, expected[name], rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_cell_is_saved_and_trained_on(
     script: Callable[[str], ModuleType], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

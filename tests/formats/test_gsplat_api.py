@@ -175,6 +175,7 @@ def expected_of(
     return image.detach(), alpha.detach(), gradients(theirs, image, alpha)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("mode", "antialiased", "sh_degree", "per_camera"),
     [

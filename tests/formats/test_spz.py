@@ -207,6 +207,7 @@ def test_damage_is_named(file: Path, change: object, message: str) -> None:
     assert str(file) in str(error.value)
 
 
+@pytest.mark.slow
 def test_a_file_that_unpacks_to_far_more_is_refused(file: Path) -> None:
     count = 10**7
     header = struct.pack("<IIIBBBB", 0x5053474E, 3, count, 0, 12, 0, 0)

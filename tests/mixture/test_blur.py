@@ -72,6 +72,7 @@ def views_of(save: Save, configured: Make) -> Callable[..., list[View]]:
     return views
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("sigma", "noise", "quality"), [(0.0, 2.0, 75), (0.5, 0.0, 95), (0.8, 2.0, 75), (1.2, 2.0, 75)]
 )

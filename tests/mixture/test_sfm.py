@@ -71,6 +71,7 @@ def test_the_stereo_pair_is_registered_with_its_known_intrinsics(stereo_pair: St
         assert model.lenses[i].is_pinhole
 
 
+@pytest.mark.slow
 def test_two_views_keep_the_focal_length_that_they_begin_with(
     sfm_conf: SfmConf, stereo_scene: SceneConf, tmp_path: Path
 ) -> None:

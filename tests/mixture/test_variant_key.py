@@ -85,7 +85,7 @@ def test_every_file_of_photos_and_mixture_counts_always_or_with_a_part(
         "mixture/degradations/__init__.py",
         "mixture/tags/__init__.py",
         "photos/scenes/kinds.py",
-        *(f"photos/download/{name}.py" for name in ("__init__", "http", "scenes", "unpack")),
+        *(f"photos/download/{name}.py" for name in ("__init__", "http", "scenes")),
     }
 
 

@@ -303,6 +303,7 @@ LENS = Lens("SIMPLE_RADIAL", (50.0, 30.0, 20.0, 0.1), 60, 40)
 HIDDEN = st.integers(0, 2**32 - 1).map(lambda seed: noise((60, 40), seed))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("degradation", "alpha"), [("downsample", False), ("digital_zoom", True), ("jpeg", False)]
 )
@@ -365,6 +366,7 @@ def test_an_upsampled_copy_has_a_mask_where_colmap_looks_for_it(tmp_path: Path) 
 # SfM
 
 
+@pytest.mark.slow
 def test_sfm_finds_no_features_outside_a_mask(tmp_path: Path, sfm_conf: SfmConf) -> None:
     photos = prepared(tmp_path / "x", noise((60, 40)), USED, factor=1)
     smooth = [images.resize(photos.read("sfm", i), 480, 320) for i in (0, 1)]

@@ -152,6 +152,7 @@ def test_equivalence_is_within_the_margins_of_the_design(made: Any) -> None:
         assert means["p_equivalent"]["gaussians"] >= 0.5
 
 
+@pytest.mark.slow
 def test_means_of_base_and_value_cover_the_pairs_that_have_a_change(made: Any) -> None:
     """Without room, whose ablation has no LPIPS: 0.1 and 0.2, which is +100 %."""
     for scene, base, value in (("fern", 0.1, 0.2), ("room", 0.5, None)):

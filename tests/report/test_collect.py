@@ -106,6 +106,7 @@ def test_a_sweep_that_runs_is_reported_with_what_is_done(made: Any) -> None:
         assert reason in report.text
 
 
+@pytest.mark.slow
 def test_a_picture_of_a_trimmed_cell_says_that_its_images_were_removed(made: Any) -> None:
     made.add(pictures=True)
     cell = made.add("plus", pictures=True)

@@ -194,6 +194,7 @@ def test_each_replicate_is_judged_by_itself(made: Any) -> None:
     assert len(found) == 2
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(st.lists(st.integers(-2000, 2000), min_size=3, max_size=9, unique=True))
 def test_it_is_what_leaving_out_each_view_in_turn_says(hundredths: list[int]) -> None:

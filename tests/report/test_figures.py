@@ -45,6 +45,7 @@ def test_the_window_lies_where_the_images_differ() -> None:
     assert differing_crop(tiny, tiny) == (slice(0, 1), slice(0, 1)), "a pixel"
 
 
+@pytest.mark.slow
 def test_the_same_images_give_the_same_bytes_in_any_style() -> None:
     crop = differing_crop(PICTURE, 1 - PICTURE)
     first = side_by_side("部屋 $x$", panels(), crop, "note")
@@ -85,6 +86,7 @@ def traded(name: str, gaussians: list[float], quality: list[float]) -> tuple[pd.
     return means, scenes.assign(scene=["fern", "horns"] * 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("higher_is_better", "better"), [(True, True), (False, False)])
 def test_a_trade_off_has_the_better_up_and_the_smaller_left(
     higher_is_better: bool, better: bool
@@ -139,6 +141,7 @@ def trained(label: str, scene: str, psnr: list[float]) -> pd.DataFrame:
     )
 
 
+@pytest.mark.slow
 def test_quality_curves_have_a_level_where_the_baseline_ends() -> None:
     scenes = pd.concat(
         [trained("baseline", "fern", [10, 16, 20]), trained("_odd $", "fern", [14, 22, 26])]

@@ -85,6 +85,7 @@ SIGNS = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(pdflatex.PDFLATEX is None, reason="there is no pdflatex")
 def test_latex_compiles(tmp_path: Path) -> None:
     wide = TextTable("Wide", tuple("abcdefghij"), (("-0.80 ↓", *"123456789"),), "r" * 10)

@@ -251,6 +251,7 @@ def test_another_base_has_a_report_of_its_own_that_names_it(made: Any) -> None:
     assert changes == pytest.approx({("baseline", "a/b {x}"): -5.0, ("c", "a/b {x}"): 5.0})
 
 
+@pytest.mark.slow
 def test_without_a_baseline_the_first_label_is_the_base(made: Any, tmp_path: Path) -> None:
     for label, psnr in (("plus", 1.0), ("lean", 1.25)):
         made.add(label, factors={"psnr": psnr})

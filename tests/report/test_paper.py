@@ -87,6 +87,7 @@ def test_a_capture_stands_beside_its_column_of_table_2(made: Any, scene: str, co
     assert signs(table)["LPIPS"] == {"Keychain": "confirmed", "Dining Room": "refuted"}[column]
 
 
+@pytest.mark.slow
 def test_other_scenes_labels_or_bases_have_no_table(made: Any) -> None:
     for scene in SCENES:
         add(made, scene, "consistency")
@@ -153,6 +154,7 @@ def test_the_table_stays_where_the_photographs_were_removed(made: Any) -> None:
     assert tables_by_texture(made) == before
 
 
+@pytest.mark.slow
 def test_the_correlation_is_one_of_ranks(made: Any) -> None:
     gains = (3.0, 0.1, 0.2, 9.0)
     for place, (scene, gain) in enumerate(zip(("aaa", "bbb", "ccc", "ddd"), gains, strict=True)):
@@ -177,6 +179,7 @@ def test_scenes_without_photographs_are_left_out(
     assert len(columns) == (3 + len(left) if left else 0)
 
 
+@pytest.mark.slow
 def test_the_texture_of_each_view_is_in_views_csv_and_the_table_on_the_page(
     made: Any, tmp_path: Path
 ) -> None:

@@ -95,6 +95,7 @@ def test_a_swept_condition_is_a_setting_of_each_ablation(made: Any) -> None:
     }
 
 
+@pytest.mark.slow
 def test_the_report_has_the_figure_where_there_are_three_values(made: Any, tmp_path: Path) -> None:
     add_weights(made)
     made.write()

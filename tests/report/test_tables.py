@@ -104,6 +104,7 @@ def test_failed_scenes_are_shown_as_failed(made: Any) -> None:
     assert ("leaves", "baseline", "", "0", "0", "not placed", reason) in missing.rows
 
 
+@pytest.mark.slow
 def test_a_long_reason_is_whole_below_the_table(made: Any) -> None:
     """A scene that failed is told what to try, by the names of its photographs."""
     reason = "scene fern failed: " + "try more photographs, " * 40
@@ -216,6 +217,7 @@ def test_a_headline_label_has_holms_p_and_a_line_in_the_legend(made: Any) -> Non
     assert "p (Holm)" not in meanings(tables(made))
 
 
+@pytest.mark.slow
 def test_the_legend_explains_only_what_occurs_and_fits_a_terminal(made: Any) -> None:
     made.add()
     made.add("a", factors={"psnr": 0.99})

@@ -52,6 +52,7 @@ def test_a_second_signal_ends_the_process_at_once() -> None:
     assert stopped("slow", signal.SIGINT, signal.SIGTERM)[0] == -signal.SIGTERM
 
 
+@pytest.mark.slow
 def test_an_ignored_signal_stays_ignored() -> None:
     assert stopped("nohup", signal.SIGINT) == (0, "ready\ntidied up\n", "")
 

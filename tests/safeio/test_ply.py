@@ -39,6 +39,7 @@ def tables(draw: st.DrawFn, *, may_have_lists: bool = True) -> NDArray[np.void]:
     return table
 
 
+@pytest.mark.slow
 @given(
     vertex=tables(may_have_lists=False),
     before=st.lists(tables(may_have_lists=False), max_size=2),

@@ -65,6 +65,7 @@ def test_the_length_of_a_quaternion_changes_no_image(backend: str, exponents: li
     assert (image - draw(double, CAMERA).image).abs().max() < 3e-5
 
 
+@pytest.mark.slow
 @FEW
 @given(exponents=st.lists(st.integers(-120, 100), min_size=5, max_size=5))
 def test_gradients_of_quaternions_of_any_length(backend: str, exponents: list[int]) -> None:

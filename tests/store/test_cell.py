@@ -34,6 +34,7 @@ from xrgs.training.dataset import Dataset
 VARIANT = cast(Variant, SimpleNamespace(id="v"))
 
 
+@pytest.mark.slow
 def test_the_controls_choose_the_views_that_are_trained_on_and_scored(
     compose: Callable[..., Conf], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -158,6 +159,7 @@ def _exchange(checkpoint: Path, other: Path) -> None:
     shutil.copy(other, checkpoint)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("spoil", "message"), [(_truncate, "not a zip"), (_exchange, "to cell")])
 def test_an_unusable_checkpoint_is_logged_and_training_starts_over(
     conf: Conf,

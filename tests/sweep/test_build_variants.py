@@ -312,6 +312,7 @@ def photographs(folder: Path, count: int, size: tuple[int, int] = (120, 80)) -> 
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("count", "size", "changes", "error"),
     [

@@ -189,6 +189,7 @@ def test_the_pixels_of_a_cell_are_those_of_the_views_that_it_draws(
         assert folder == tmp_path / "trimmed-k-1"
         return SimpleNamespace(views=views)
 
+    (tmp_path / "trimmed-k-1").mkdir()
     estimate.read_views.cache_clear()
     monkeypatch.setattr(saved_variant, "read_manifest", read)
     drawn, largest = estimate._pixels(tmp_path, "k-1", compose(*overrides))

@@ -401,6 +401,7 @@ def test_a_launcher_s_worker_answers_unless_its_sweep_has_ended(
         run_hydra_job(job_config)
 
 
+@pytest.mark.slow
 def test_jobs_of_one_machine_have_a_gpu_each(
     session: SweepSession, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -32,6 +32,7 @@ from xrgs.sweep.plan import PlannedCell
 from xrgs.sweep.study import LOST, Launches
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "threads", "at_once", "cores"),
     [

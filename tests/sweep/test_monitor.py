@@ -186,6 +186,7 @@ def test_past_cells_decide_at_first_and_the_own_pace_in_the_end(watched: Watched
         assert replace(snapshot, slowness=1.0).rest_s(running) == pytest.approx(seconds)
 
 
+@pytest.mark.slow
 def test_a_log_has_a_line_when_a_cell_ends_and_the_last_at_the_end(
     watched: Watched, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -255,6 +255,7 @@ def matched(plan: Sequence[PlannedCell]) -> dict[str, PlannedCell]:
     return cells
 
 
+@pytest.mark.slow
 def test_one_command_line_has_arms_and_a_control_for_each(study: Callable[..., Study]) -> None:
     plan = study()._plan(["+ablation=plus,lean,[keep_large,count_matched]", "matched_to=plus,lean"])
     cells = {cell.spec.label: cell for cell in matched(plan).values()}
@@ -271,6 +272,7 @@ def test_one_command_line_has_arms_and_a_control_for_each(study: Callable[..., S
     assert not mixed_prune_rules(plan)
 
 
+@pytest.mark.slow
 def test_each_replicate_and_condition_is_matched_to_its_own_count(
     study: Callable[..., Study],
 ) -> None:
@@ -334,6 +336,7 @@ def test_a_count_to_match_of_every_cell_of_a_file_is_refused(study: Callable[...
         made._plan(["+ablation=plus"])
 
 
+@pytest.mark.slow
 def test_a_control_with_another_prune_rule_is_named_once(study: Callable[..., Study]) -> None:
     base = "count_matched,[keep_large,count_matched]"
     plan = study()._plan([f"+ablation={base}", "matched_to=keep_large", "seed=0,1"])

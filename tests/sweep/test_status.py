@@ -163,6 +163,7 @@ def test_what_is_no_cell_is_named(intact: Store) -> None:
             describe(path)
 
 
+@pytest.mark.slow
 def test_it_writes_nothing_and_needs_no_torch(
     run_command: Callable[..., tuple[int, str, str]], store: Store, tmp_path: Path
 ) -> None:
@@ -188,6 +189,7 @@ def test_names_of_a_store_are_not_obeyed_and_stay_on_their_lines(store: Store, c
     ]
 
 
+@pytest.mark.slow
 def test_a_watch_shows_the_cells_in_training_until_ctrl_c_and_changes_nothing(store: Store) -> None:
     def files() -> dict[str, int]:
         return {name: status.st_mtime_ns for name, status in walk_files(store.path)}

@@ -63,6 +63,7 @@ def planned_cell(conf: config.Conf, seed: int) -> PlannedCell:
     return PlannedCell(spec, conf, "v", identity, cell_id(identity))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("reason", "fail_fast", "said"),
     [(STORE_FULL, True, STORE_FULL), ("", True, FAIL_FAST), ("", False, None)],
@@ -116,6 +117,7 @@ def test_seeds_share_one_composed_config_and_each_cell_is_identified_once(
     assert made._identified(plan, store) == plan
 
 
+@pytest.mark.slow
 def test_cells_that_differ_in_numbers_share_one_config_and_get_their_own_values(
     study: Callable[..., Study],
 ) -> None:
@@ -132,6 +134,7 @@ def test_cells_that_differ_in_numbers_share_one_config_and_get_their_own_values(
         made._plan(["scene=folder", "scene.path=/pa/room,/pb/room"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fixed", "conditions"),
     [

@@ -170,6 +170,7 @@ EACH_KIND = pytest.mark.parametrize(
 )
 
 
+@pytest.mark.slow
 @EACH_KIND
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # MLflow's own, of SQLAlchemy 2.1
 def test_a_resumed_cell_continues_its_curve(swept: Swept, kind: str) -> None:

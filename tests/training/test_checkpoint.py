@@ -189,5 +189,5 @@ def test_a_full_disk_costs_the_checkpoint_and_not_the_run(
         result = train(data, few_steps, Checkpoint(tmp_path / "c.npz", "cell", EVERY_STEP))
     assert comparable(result) == comparable(train(data, few_steps))
     reason = "[Errno 28] No space left on device"
-    assert f"c.npz: no checkpoint was written after step 0 ({reason})" in caplog.text
+    assert f"c.npz: no checkpoint was written after step 0 ({reason}" in caplog.text
     assert not list(tmp_path.iterdir())

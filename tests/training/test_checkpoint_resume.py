@@ -129,6 +129,7 @@ def train_with_checkpoints(
     return train_cell(data, conf, written)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "backend",
     ["native", pytest.param("torch", marks=[pytest.mark.slow, pytest.mark.exhaustive])],

@@ -140,6 +140,7 @@ def test_the_count_is_checked_once_densification_has_stopped(
             checked()
 
 
+@pytest.mark.slow
 def test_the_matched_run_is_the_plain_run_with_its_threshold(
     data: Dataset, short: Conf, trained: TrainingResult
 ) -> None:

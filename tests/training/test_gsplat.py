@@ -51,6 +51,7 @@ def config(ablation: str, *changes: str, backend: str = "gsplat") -> Conf:
     return compose(f"+ablation={ablation}", f"splat.backend={backend}", ALPHA_MAX, *changes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ablation", ["xrgs", "plus"])
 def test_fifty_steps_are_those_of_the_native_backend(data: Dataset, ablation: str) -> None:
     # The first Gaussians are round, and the gradients of their rotations are rounding only. With
@@ -119,6 +120,7 @@ def test_a_killed_run_continues(
     assert comparable(again) == comparable(whole)
 
 
+@pytest.mark.slow
 def test_evaluation_renders_on_the_gpu_and_scores_on_the_processor(
     data: Dataset, tmp_path: Path
 ) -> None:

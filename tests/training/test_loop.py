@@ -50,6 +50,7 @@ ABLATIONS = sorted(
 IN_PLUS = set(OmegaConf.load(CONF_DIR / "ablation" / "plus.yaml").defaults)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["torch", "native"])
 def test_the_same_seed_gives_the_same_bits_and_another_does_not(
     data: Dataset, backend: str

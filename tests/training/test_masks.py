@@ -99,6 +99,7 @@ COMPONENTS = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("components", [(), COMPONENTS], ids=["baseline", "components"])
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_hidden_pixels_change_no_bit_of_training_and_no_score(

@@ -119,6 +119,7 @@ def test_values_are_kept_as_far_as_the_bytes_go(
     ]
 
 
+@pytest.mark.slow
 def test_what_is_not_kept_changes_no_bit_and_takes_less_memory(
     data: Dataset, monkeypatch: pytest.MonkeyPatch, trained: TrainingResult
 ) -> None:

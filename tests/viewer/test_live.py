@@ -37,6 +37,7 @@ def is_open(url: str) -> bool:
         return tried.connect_ex(("127.0.0.1", int(url.rpartition(":")[2]))) == 0
 
 
+@pytest.mark.slow
 def test_a_page_of_this_machine_has_a_frame_for_each_model_until_it_ends(
     model: MakeModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -80,6 +81,7 @@ def test_a_port_in_use_is_named(model: MakeModel) -> None:
         pass
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [1e-5, 1e4])
 def test_gaussians_of_any_size_reach_viser(
     model: MakeModel, monkeypatch: pytest.MonkeyPatch, size: float

@@ -52,6 +52,7 @@ def test_the_fingerprint_follows_names_and_bytes_alone(fill: Fill, tmp_path: Pat
     assert scenes.fingerprint(conf) != first
 
 
+@pytest.mark.slow
 def test_the_procedural_scene_is_rendered_once(tmp_path: Path) -> None:
     first = scenes.resolve(PROCEDURAL, tmp_path, 60)
     assert stems(first) == ["view_000", "view_001", "view_002"]
@@ -64,6 +65,7 @@ def test_the_procedural_scene_is_rendered_once(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir() if p.name[0] != "."] == [first.fingerprint]
 
 
+@pytest.mark.slow
 def test_other_images_do_not_become_the_procedural_scene(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -73,6 +73,7 @@ def all_finite(values: list[Tensor]) -> bool:
 # --- finite numbers whose gradients are not -----------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("scale", [1e-7, 1e-10])
 def test_without_dilation(isa: str, antialiased: bool, scale: float) -> None:

@@ -166,6 +166,7 @@ def test_sizes(isa: str, width: int, height: int, count: int) -> None:
     check(make_scene(count, camera, seed=width + count), camera)
 
 
+@pytest.mark.slow
 def test_absgrad(isa: str) -> None:
     camera = make_camera(50, 37, turned=True)
     scene = make_scene(300, camera, seed=13, size=3.0)

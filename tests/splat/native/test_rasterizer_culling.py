@@ -74,6 +74,7 @@ def crowd_and_truth(where: str) -> tuple[Scene, Camera, Tensor]:
     return scene, camera, exact.image
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("where", "name"),
     [*(("near", name) for name in NAMES), pytest.param("far", "all", marks=pytest.mark.slow)],

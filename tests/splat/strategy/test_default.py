@@ -80,6 +80,7 @@ def assert_same(ours: Ours, theirs: Theirs) -> None:
         assert torch.equal(ours.strategy.visible_count[0], theirs.state["count"])
 
 
+@pytest.mark.slow
 @settings(max_examples=60)
 @given(
     count=st.integers(1, 60),

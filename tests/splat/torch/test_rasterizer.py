@@ -39,6 +39,7 @@ def test_tiles_and_batches_make_no_difference(monkeypatch: pytest.MonkeyPatch) -
             torch.testing.assert_close(ours, theirs, rtol=1e-11, atol=1e-11)
 
 
+@pytest.mark.slow
 @given(
     seed=st.integers(0, 2**31),
     count=st.integers(0, 30),

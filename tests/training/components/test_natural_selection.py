@@ -125,6 +125,7 @@ def test_within_5_percent_of_the_budget_the_rest_goes_at_once(
         assert faded == list(range(removed))
 
 
+@pytest.mark.slow
 def test_a_run_ends_with_the_budget(data: Dataset) -> None:
     # Without resets, which would leave no more than the budget, and with a rate of the opacities at
     # which they can fade in 16 steps.

@@ -132,6 +132,7 @@ def _after_20_steps(data: Dataset, conf: Conf, *extra: ResolutionSchedule) -> Ga
     return seen[0]
 
 
+@pytest.mark.slow
 def test_the_start_is_a_training_on_small_photographs(data: Dataset) -> None:
     conf = compose("train.steps=40", "splat.backend=auto", "train.evaluate_every=20")
     component = HalvedFirst(conf.components.resolution_schedule, data.train, "auto")

@@ -168,6 +168,7 @@ def found(render: Tensor, photograph: Tensor) -> tuple[float, float]:
     return blur.of("low")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("down", "across"), [(0.8, 0.8), (0.8, 1.5)])
 def test_the_variances_of_a_blur_and_of_the_box_of_a_pixel_add_up(
     down: float, across: float

@@ -31,6 +31,7 @@ def start(data: Dataset) -> tuple[Gaussians, Gaussians]:
     return sparse, dense.dense_start(data, sparse, BACKEND, torch.Generator().manual_seed(1))
 
 
+@pytest.mark.slow
 def test_sfm_points_come_first_and_squares_fill_the_budget(scene: TrueScene) -> None:
     sparse, first = start(scene.data)
     budget = round(dense.BUDGET * scene.data.view_pixels)
@@ -107,6 +108,7 @@ def test_two_views_are_enough_and_too_little_coverage_is_not(
     assert "of the training views are covered" in caplog.text
 
 
+@pytest.mark.slow
 def test_a_continued_run_ends_with_the_same_bits(scene: TrueScene, tmp_path: Path) -> None:
     data = replace(scene.data, train=scene.data.train[:5])
     conf = compose(
