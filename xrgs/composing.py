@@ -29,7 +29,6 @@ from xrgs.splat.settings import NOMINAL_STEPS, outside_limits
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
-
 #: The start of an interpolation and the backslashes before it; an odd number escapes it.
 _INTERPOLATION = re.compile(r"(\\*)\$\{")
 #: The key at the end of msgspec's error messages: "... - at `$.train.steps`".
@@ -114,10 +113,6 @@ def to_conf(cfg: DictConfig) -> Conf:
         if path is not None and path.startswith("~"):
             setattr(group, name, str(user_path(path)))
     _check_limits(conf)
-    if (seed := conf.variant.sfm.seed) >= 2**31:
-        raise XrgsError(
-            f"variant.sfm.seed={seed}: must be below 2^31 = {2**31}, as COLMAP holds it"
-        )
     _check_strategy(conf)
     return conf
 

@@ -74,7 +74,7 @@ class SfmConf:
     max_num_features: int
     init_min_tri_angle: float
     min_registered: float
-    seed: int = limited(least=0)
+    seed: int = limited(least=0, below=2**31)  # as COLMAP holds it
     camera: str
     first_octave: int | None
     min_inliers: int
