@@ -536,6 +536,8 @@ def _make_variant(request: Mapping[str, Any]) -> dict[str, Any]:
 
     log_to_stderr()
     set_portable_mkl()
+    with machine.without_collections():
+        import torch  # noqa: F401  scenes and photographs are made with it
     conf, store = from_dict(request["conf"]), Store(Path(request["store"]))
     if (trimmed := request.get("variant")) is None:
         built = variant.build(conf.scene, conf.variant, store.variants, store.scenes)
