@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import math
 import os
 import signal
@@ -21,6 +22,7 @@ from xrgs.runtime.machine import (
     set_portable_mkl,
     single_torch_thread,
     usable_cores,
+    without_collections,
 )
 
 
@@ -193,3 +195,56 @@ def test_memory_is_that_of_all_processes_of_a_session() -> None:
         assert 50e6 < machine.resident_bytes(child.pid) < 500e6
         child.kill()
     assert machine.resident_bytes(child.pid) == 0
+
+
+#: An object that refers to itself, which only a collection can free, and says so.
+_IN_A_CYCLE = """
+import os
+
+class Cycle:
+    def __init__(self):
+        self.itself = self
+
+    def __del__(self, write=os.write):
+        write(1, b"collected")
+
+cycle = Cycle()
+"""
+
+
+def test_nothing_is_collected_at_the_end_of_a_quick_process() -> None:
+    def output(script: str) -> str:
+        command = [sys.executable, "-c", script]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+    assert output(_IN_A_CYCLE) == "collected"
+    quick = "from xrgs.runtime.machine import end_quickly; end_quickly()"
+    at_exit = "import atexit; atexit.register(print, 'functions of atexit run')"
+    assert output(f"{quick}; {at_exit}{_IN_A_CYCLE}") == "functions of atexit run\n"
+
+
+def test_nothing_is_collected_in_a_block_without_collections() -> None:
+    collections: list[str] = []
+
+    def note(phase: str, _: object) -> None:
+        collections.append(phase)
+
+    def allocate() -> None:
+        kept = [[number] for number in range(10 * gc.get_threshold()[0])]
+        assert kept
+
+    gc.callbacks.append(note)
+    try:
+        with without_collections():
+            allocate()
+            assert not collections
+        assert gc.isenabled()
+        allocate()
+        assert collections
+        gc.disable()
+        with without_collections():
+            pass
+        assert not gc.isenabled()  # as before
+    finally:
+        gc.enable()
+        gc.callbacks.remove(note)

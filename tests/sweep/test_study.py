@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -387,3 +389,16 @@ def test_the_weights_are_fetched_once_unless_it_is_a_dry_run_or_switched_off(
     provide_lpips(fetch=True, dry_run=False)
     assert capsys.readouterr().err == ""
     assert len(fetched) == 1
+
+
+@pytest.mark.slow
+def test_what_a_report_takes_seconds_to_import_is_imported_in_advance() -> None:
+    script = (
+        "import sys\n"
+        "from xrgs.sweep import study\n"
+        "slow = {'matplotlib.figure', 'pandas', 'torch'}\n"
+        "assert not slow & sys.modules.keys()\n"
+        "study._import_report()\n"
+        "assert slow <= sys.modules.keys()\n"
+    )
+    subprocess.run([sys.executable, "-P", "-c", script], check=True)

@@ -23,6 +23,7 @@ from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, Pri
 import xrgs
 from xrgs.config import known_keys
 from xrgs.errors import XrgsError
+from xrgs.runtime.machine import end_quickly
 from xrgs.runtime.streams import guard_streams, say
 from xrgs.safeio.paths import user_path
 from xrgs.safeio.sanitize import for_line
@@ -87,6 +88,7 @@ def run(
         SystemExit: With code 1 on an `XrgsError`, and with code 2 on wrong usage.
     """
     guard_streams()
+    end_quickly()
     answer_version(command)
     functions = {command: target} if callable(target) else target
     names = frozenset(name for function in functions.values() for name in _names(function))

@@ -18,6 +18,7 @@ from xrgs.cli.options import answer_version, errors_as_messages
 from xrgs.cli.overrides import check_words, explained, files, with_options_first, with_quotes
 from xrgs.composing import escape_interpolations
 from xrgs.errors import XrgsError, did_you_mean
+from xrgs.runtime.machine import end_quickly
 from xrgs.runtime.signals import exit_on_signal
 from xrgs.runtime.streams import guard_streams, say
 from xrgs.safeio.paths import user_path
@@ -84,6 +85,7 @@ class RerunConf:
 def main() -> None:
     """Run `xrgs-sweep [+ablation=NAME] [KEY=VALUE[,VALUE]...]...`."""
     guard_streams()
+    end_quickly()
     arguments = sys.argv[1:]
     if {"-h", "--help"} & set(arguments):  # Hydra's own help takes seconds to list its groups
         groups = ("ablation", "scene", "preset", "sweeps")

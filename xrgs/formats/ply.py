@@ -75,7 +75,7 @@ def save_ply(
         >>> save_ply("splats.ply", gaussians)
     """
     path = Path(path) if isinstance(path, str) else path
-    unit = torch.from_numpy(unit_quaternions(gaussians.quats))
+    quats = gaussians.quats if exact else torch.from_numpy(unit_quaternions(gaussians.quats))
     columns = [
         gaussians.means,
         torch.zeros_like(gaussians.means),  # normals, which viewers expect but ignore
@@ -83,7 +83,7 @@ def save_ply(
         gaussians.shN.transpose(1, 2).flatten(1),
         gaussians.opacities[:, None],
         gaussians.scales,
-        gaussians.quats if exact else unit,
+        quats,
     ]
     table = torch.cat([column.detach().float() for column in columns], dim=1)
     header = [
@@ -95,7 +95,7 @@ def save_ply(
         file.write(b"ply\nformat binary_little_endian 1.0\n")
         file.write(ANTIALIASED_LINE if antialiased else b"")
         file.write("".join(f"{line}\n" for line in header).encode())
-        file.write(table.numpy().astype("<f4").tobytes())
+        file.write(table.numpy().astype("<f4", copy=False).data)
 
 
 @on_cpu_in_float32

@@ -17,6 +17,7 @@ import numpy as np
 import pandas as pd
 from matplotlib import style
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
@@ -339,5 +340,6 @@ def _show(axes: Axes, image: Image, interpolation: str) -> None:
 
 def _png(figure: Figure) -> bytes:
     stream = io.BytesIO()
-    figure.savefig(stream, format="png", metadata={"Software": SOFTWARE})
+    # Not savefig, which gives the same bytes and draws twice: the first time only for the layout.
+    FigureCanvasAgg(figure).print_png(stream, metadata={"Software": SOFTWARE})
     return stream.getvalue()

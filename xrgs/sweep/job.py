@@ -1,9 +1,9 @@
 """A job: one cell, or one variant, in a child process with limits, on the launcher's machine.
 
 Hydra's launcher calls `run_hydra_job`, which trains one planned cell under the cell's lease. The
-training is in a child process, which a kill or a segfault ends and nothing else. The parent never
-imports torch. The child runs `python -m xrgs.sweep.job WORK REQUEST ANSWER`: the kind of work, the
-file of its arguments, and the file for its answer.
+training is in a child process, which a kill or a segfault ends and nothing else. The parent runs
+torch only for the report. The child runs `python -m xrgs.sweep.job WORK REQUEST ANSWER`: the kind
+of work, the file of its arguments, and the file for its answer.
 
 A cell that fails is a state and not an exception, so that no launcher drops the rest of its batch.
 """
@@ -536,6 +536,8 @@ def _make_variant(request: Mapping[str, Any]) -> dict[str, Any]:
 
     log_to_stderr()
     set_portable_mkl()
+    with machine.without_collections():
+        import torch  # noqa: F401  scenes and photographs are made with it
     conf, store = from_dict(request["conf"]), Store(Path(request["store"]))
     if (trimmed := request.get("variant")) is None:
         built = variant.build(conf.scene, conf.variant, store.variants, store.scenes)
@@ -546,8 +548,9 @@ def _make_variant(request: Mapping[str, Any]) -> dict[str, Any]:
 
 def _run_cell(request: Mapping[str, Any]) -> dict[str, Any]:
     _enter_folder(Path(request["cell"]), request["inode"])
-    from xrgs.mixture import variant
-    from xrgs.store import cell
+    with machine.without_collections():
+        from xrgs.mixture import variant
+        from xrgs.store import cell
 
     stop = StopRequest()
     stop.watch()
@@ -606,6 +609,7 @@ def main(work: str, request: str, answer: str) -> None:
     """Do one piece of work in the child, and write its answer or the reason why it failed."""
     guard_streams()
     faulthandler.enable()
+    machine.end_quickly()
     follow_parent()
     machine.offer_to_oom_killer()
     given: dict[str, Any] = {}

@@ -18,6 +18,7 @@ import copy
 import json
 import re
 import sys
+import threading
 import time
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -40,7 +41,7 @@ from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.evaluation.lpips import weights
 from xrgs.photos import scenes
 from xrgs.runtime import lease
-from xrgs.runtime.machine import gpus, usable_cores
+from xrgs.runtime.machine import gpus, set_portable_blas, usable_cores, without_collections
 from xrgs.runtime.progress import log_line
 from xrgs.runtime.streams import say
 from xrgs.safeio.files import is_transient
@@ -157,6 +158,10 @@ class Study:
         _tidy({cell.cell_id for cell in plan if cell.cell_id and cell.state.name == "done"}, store)
         # At the start, so that a report can be made while it runs, and after it was stopped.
         sweep_id = store.write_sweep(arguments, plans.record(plan))
+        if plans.left_to_train(plan):
+            # It takes two seconds. The first cell's process starts meanwhile, on another core.
+            set_portable_blas()  # for its copy of OpenBLAS, as `run_in_child` sets it
+            threading.Thread(target=_import_report, name="xrgs-report").start()
         with track.Tracker(plan[0].conf.track, store) as tracker:
             with SweepMonitor(store.cells_folder, brief=self._brief) as monitor:
                 plan = self._run_until_complete(plan, store, [monitor, tracker])
@@ -441,6 +446,13 @@ class _JobConfigLoader:
             config.hydra.job.override_dirname = overrides[0]
         OmegaConf.set_readonly(config.hydra, False)
         return config
+
+
+def _import_report() -> None:
+    """Import what a report with pictures needs: pandas, matplotlib and torch."""
+    with without_collections():
+        import xrgs.report
+        import xrgs.viewer.trained  # noqa: F401
 
 
 def _first_line(error: Exception) -> str:
