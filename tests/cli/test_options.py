@@ -117,6 +117,9 @@ def test_a_value_behind_an_option_may_have_an_equals_sign(
         ("data download", "{llff}"),
         ("data export a --format obj", "'colmap', 'nerfstudio'"),
         ("render abc --size 504", "--size"),
+        ("report --store=", "--store: is empty; give a path"),
+        ("train garden store=", "--store: is empty; give a path"),
+        ("data inspect garden store=", "is empty; give a path"),
     ],
 )
 def test_wrong_usage_is_named_and_ends_with_2(

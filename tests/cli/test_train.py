@@ -159,6 +159,7 @@ def test_more_time_gives_larger_views_and_more_steps_and_never_exceeds_the_time(
         (["garden", "--out", "garden"], "--out garden: is not empty; name a new folder"),
         (["garden", "--out", "a_file"], "--out a_file: is a file; name a new folder"),
         (["garden", "--out", "two.ply"], "--out two.ply: is a folder; name a file"),
+        (["garden", "--store", "a_file", "--dry-run"], "store=a_file can't be written (Not a dir"),
         (["two"], "scene two: 2 photographs are too few: 1 is held out to test on"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
