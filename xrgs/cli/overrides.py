@@ -510,7 +510,7 @@ def _meant(word: str, before: str) -> str:
 
 
 def check_no_axis(words: Sequence[str]) -> None:
-    """Refuse overrides with several values, since one cell is trained.
+    """Refuse overrides with several values, where one config is composed.
 
     Raises:
         XrgsError: An override is an axis; the message names it.
