@@ -273,6 +273,11 @@ def test_an_error_of_hydra_is_one_line_with_a_hint(kind: type[Exception]) -> Non
         raise kind("two\nlines")
 
 
+def test_an_error_of_a_file_that_is_no_yaml_of_the_config_stays(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError), explained():
+        (tmp_path / "gone").read_bytes()
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

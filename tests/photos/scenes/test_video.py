@@ -306,11 +306,16 @@ def test_names_are_of_the_first_frames_and_not_of_all(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_video(tmp_path / "a.mp4", [textured(10 * i, 0) for i in range(20)])
-    decoded = []
-    shape = video._square
-    monkeypatch.setattr(video, "_square", lambda *size: decoded.append(size) or shape(*size))
+    decoded: list[int] = []
+    square = video._square
+
+    def counted(width: int, height: int, aspect: Fraction) -> tuple[int, int]:
+        decoded.append(width)
+        return square(width, height, aspect)
+
+    monkeypatch.setattr(video, "_square", counted)
     assert scenes.names(conf(tmp_path / "a.mp4", 3)) == ["frame_0000", "frame_0001", "frame_0002"]
-    assert len(decoded) == 1
+    assert decoded == [WIDTH]
 
 
 def test_a_truncated_video_gives_the_frames_that_it_has(tmp_path: Path) -> None:
