@@ -132,6 +132,10 @@ def test_results_that_cant_be_written_are_refused_before_any_measurement(
         (["--save=a.npz"], "--save FILE.npz needs --cell FOLDER and --view NAME"),
         (["--save=a.npz", "--cell=nowhere", "--view=a"], "--cell nowhere: is absent"),
         (["--repeats=0"], "repeats must be at least 1"),
+        (["--out="], "--out: is empty; give a path"),
+        (["--load", ""], "--load: is empty; give a path"),
+        (["--seed", "-1"], "--seed -1: must be 0 to 2^63 - 1"),
+        (["--seed", str(2**63)], f"--seed {2**63}: must be 0 to 2^63 - 1"),
     ],
 )
 def test_bad_arguments_end_in_one_line(

@@ -79,6 +79,9 @@ def test_inspect_takes_a_folder_of_photographs_as_they_are(
     code, _, err = xrgs_data("inspect", *words, "--out", "sheet.jpg")
     assert (code, len(built)) == (1, 1)
     assert err == "xrgs-data: --out sheet.jpg: the sheet is a PNG; name a file FILE.png"
+    for word in ("variant.factor=2,4", "variant.factor=range(2,4)", "+ablation=plus,lean"):
+        code, _, err = xrgs_data("inspect", "garden", word)
+        assert (code, err) == (1, f"xrgs-data: {word}: give one value; xrgs-sweep takes several")
     code, _, err = xrgs_data("inspect", "graden")
     assert code == 1
     assert err == "xrgs-data: graden: there is no such folder, and no store xrgs-store"

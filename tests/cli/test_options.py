@@ -117,6 +117,9 @@ def test_a_value_behind_an_option_may_have_an_equals_sign(
         ("data download", "{llff}"),
         ("data export a --format obj", "'colmap', 'nerfstudio'"),
         ("render abc --size 504", "--size"),
+        ("report --store=", "--store: is empty; give a path"),
+        ("train garden --store=", "--store: is empty; give a path"),
+        ("data inspect garden --store=", "is empty; give a path"),
     ],
 )
 def test_wrong_usage_is_named_and_ends_with_2(
@@ -138,6 +141,8 @@ def test_wrong_usage_is_named_and_ends_with_2(
         ("report --store gone", "--store gone is not a store"),
         ("view abc --limit 0", "--limit 0: must be at least 1"),
         ("view gone.ply", "gone.ply: cannot be read"),
+        ("train . store=", "store=: is empty; give a path"),
+        ("data inspect . store=", "store=: is empty; give a path"),
     ],
 )
 def test_an_error_is_a_message_and_ends_with_1(

@@ -15,7 +15,7 @@ from omegaconf.errors import ConfigKeyError
 
 from tests.conftest import composed_by_hydra
 from xrgs import config
-from xrgs.cli.overrides import explained, with_options_first, with_quotes
+from xrgs.cli.overrides import explained, replaced_words, with_options_first, with_quotes
 from xrgs.cli.sweep import texts
 from xrgs.composing import ARMS
 from xrgs.errors import XrgsError
@@ -114,6 +114,9 @@ def test_lists_quotes_and_other_keys_stay_as_they_are(tmp_path: Path) -> None:
     assert override == f"scene.path='{tmp_path}/a, b/**'"
     with pytest.raises(XrgsError, match=r"store=\\udcff.*not valid Unicode"):
         with_quotes(["store=\udcff"])
+    for key in config.PATHS:  # a variable of the shell that is not set
+        with pytest.raises(XrgsError, match=rf"^{key}=: is empty; give a path, or leave it out"):
+            with_quotes([f"{key}="])
 
 
 @pytest.mark.parametrize(
@@ -174,7 +177,12 @@ HEAD = "# @package _global_\n"
         (HEAD + "components: {mip: {every: x}}", "components.mip.every: Value 'x' of type 'str'"),
         (HEAD + "components: {plugins: {3: {}}}", "components.plugins.3: Key 3 (int)"),
         (HEAD + "seed: [", "a YAML file of the config can't be read: .*mine.yaml"),
-        (HEAD + "seed: \udcff", "a YAML file of the config can't be read"),
+        (HEAD + "seed: \udcff", "ablation/mine.yaml: is not in UTF-8"),
+        (HEAD + "- a\n- b", "ablation/mine.yaml: is a list; it must have lines KEY: VALUE"),
+        (HEAD + "train: 30", "ablation/mine.yaml: train: takes keys of its own, and not 30"),
+        (HEAD + "components: {mip: [3]}", "components.mip: takes keys of its own, and not [3]"),
+        (HEAD + "just words", "ablation/mine.yaml: Key 'just words' not in"),
+        (HEAD + "3", "ablation/mine.yaml: must have lines KEY: VALUE"),
     ],
 )
 def test_a_mistake_in_a_file_of_the_users_own_is_named(
@@ -265,6 +273,11 @@ def test_an_error_of_hydra_is_one_line_with_a_hint(kind: type[Exception]) -> Non
         raise kind("two\nlines")
 
 
+def test_an_error_of_a_file_that_is_no_yaml_of_the_config_stays(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError), explained():
+        (tmp_path / "gone").read_bytes()
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -313,6 +326,11 @@ def test_a_typo_is_one_line_with_what_was_meant(
         ("train.steps=(100,200)", "train.steps=100,200"),
         ("train.steps=choice(range(100,300,100))", "'train.steps=range(100,300,100)'"),
         ("seed=sort(choice(range(3)))", "'seed=sort(range(3))'"),
+        ("+ablation=[a,b", "'+ablation=[a,b]'"),
+        ("+ablation=a,b]", "'+ablation=[a,b]'"),
+        ("+ablation=(a,b", "+ablation=a,b"),
+        ("+ablation=a,b)", "+ablation=a,b"),
+        ("train.steps=100,200]", "train.steps=100,200"),
     ],
 )
 def test_an_override_that_hydra_s_grammar_refuses_is_answered_with_the_words_to_type(
@@ -326,8 +344,82 @@ def test_an_override_that_hydra_s_grammar_refuses_is_answered_with_the_words_to_
 
 
 @pytest.mark.parametrize(
+    ("word", "meant"),
+    [
+        ("seed=0-3", "seed=0,1,2,3"),
+        ("seed=0-3", "'seed=range(0,4)'"),
+        ("seed=0..2", "seed=0,1,2"),
+        ("seed=0:2", "seed=0,1,2"),
+        ("seed=0–2", "seed=0,1,2"),
+        ("seed=0 to 2", "seed=0,1,2"),
+        ("seed=[0-2]", "seed=0,1,2"),
+        ("seed=0-2,7", "seed=0,1,2,7"),
+        ("seed=0 1 2", "seed=0,1,2"),
+        ("seed=0;1;2", "seed=0,1,2"),
+        ("seed=[0,1,2]", "seed=0,1,2"),
+        ("seed=(0,1,2)", "seed=0,1,2"),
+        ("variant.hr_fraction=0.1 0.2", "variant.hr_fraction=0.1,0.2"),
+        ("train.steps=100-30000", "'train.steps=range(100,END,STEP)'"),
+        ("variant.hr_fraction=0.1-0.3", "'variant.hr_fraction=range(0.1,END,STEP)'"),
+    ],
+)
+def test_numbers_in_a_notation_of_people_are_answered_with_the_words_to_type(
+    word: str, meant: str
+) -> None:
+    """The words to type have the numbers that a reader of the notation would list."""
+    with pytest.raises(XrgsError) as refused:
+        with_quotes([word])
+    assert str(refused.value).startswith(f"{word}: ")
+    assert meant in str(refused.value)
+    if "END" not in meant:
+        (typed,) = with_quotes(shlex.split(meant))
+        read = [spec.shared[0].partition("=")[2] for spec in expand([typed])]
+        assert read == re.findall(
+            r"[\d.]+", "0 1 2 3" if "range" in meant else meant.partition("=")[2]
+        )
+
+
+@pytest.mark.parametrize(
+    "word", ["seed=3", "seed=-3", "train.optimizer.x=1e-3", "seed=${variant.seed}", "seed=0,1"]
+)
+def test_numbers_of_hydra_s_grammar_stay(word: str) -> None:
+    assert with_quotes([word]) == [word]
+
+
+def test_words_that_a_later_one_replaces_are_said(sweep_here: RunCommand) -> None:
+    """As bash makes them of `seed={0..2}`; a word that is only repeated is no mistake."""
+    said = "seed is given 3 times, and seed=2 replaces the others; for all of them write seed=0,1,2"
+    words = ["seed=0", "scene=motorcycle", "seed=1", "scene=motorcycle", "seed=2", "seed=2"]
+    assert replaced_words(words[:5]) == [said]
+    assert replaced_words([*words[:2], words[3], "--config-dir=a", "--config-dir=b"]) == []
+    assert replaced_words(["+ablation=a", "ablation=[b]"]) == [
+        "ablation is given 2 times, and ablation=[b] replaces the others; for all of them write"
+        " 'ablation=a,[b]'"
+    ]
+    code, out, err = sweep_here(*words[:5], "variant.test_every=0", "dry_run=true")
+    assert (code, out) == (0, "")
+    assert said in err.splitlines()
+    assert err.count(" / seed ") == err.count(" / seed 2") == 1
+
+
+@pytest.mark.parametrize(
+    "word", ["+ablation=[a,b", "+ablation=(a,b", "+ablation=a,b]", "+ablation=a,b)", "scene=[a,b"]
+)
+def test_a_list_of_files_that_lacks_a_bracket_is_named_whole(word: str) -> None:
+    """It is not taken for files whose names have brackets, as `[a` and `b`."""
+    (quoted,) = with_quotes([word])
+    assert quoted == word
+    with pytest.raises(XrgsError, match=re.escape(f"{word}: ")) as refused, explained():
+        expand([quoted])
+    assert "; write " in str(refused.value)
+
+
+@pytest.mark.parametrize(
     ("word", "said"),
     [
+        ("sédé=3", "there is no such key"),
+        ("a b=3", "there is no such key"),
+        ("train.stebs!=3", "there is no such key; did you mean train.steps or"),
         ("train.steps=100;200", "several values are written as train.steps=1,2,3 or"),
         ("seed=foo(1,2)", "can't be read"),
         ("seed=range(a,b)", "can't be read"),

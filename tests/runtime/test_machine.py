@@ -20,7 +20,7 @@ from xrgs.runtime.machine import (
     gpus,
     set_portable_blas,
     set_portable_mkl,
-    single_torch_thread,
+    torch_threads,
     usable_cores,
     without_collections,
 )
@@ -105,10 +105,10 @@ def test_a_block_has_one_thread_and_the_others_return_at_its_end() -> None:
     before = torch.get_num_threads()
     try:
         torch.set_num_threads(3)
-        with single_torch_thread() as threads:
+        with torch_threads(1) as threads:
             assert (threads, torch.get_num_threads()) == (3, 1)
         assert torch.get_num_threads() == 3
-        with pytest.raises(ZeroDivisionError), single_torch_thread():
+        with pytest.raises(ZeroDivisionError), torch_threads(1):
             _ = 1 / 0
         assert torch.get_num_threads() == 3
     finally:

@@ -59,6 +59,8 @@ SMOKE = BenchmarkSizes(
 #: trained scene of llff/fern with the same numbers of Gaussians and pixels.
 SCENE_SIZE_PER_SPACING = 1.88
 _LR_FACTOR = 5
+#: torch's generator takes seeds below this one.
+_SEEDS = 2**63
 
 
 def run(settings: Settings) -> str:
@@ -70,10 +72,15 @@ def run(settings: Settings) -> str:
     Raises:
         XrgsError: An argument is wrong, or a file cannot be read or written.
     """
+    for name, value in vars(settings).items():
+        if value == "":  # as of an unset variable, which would mean the current folder
+            raise XrgsError(f"--{name}: is empty; give a path, or leave the option out")
     if settings.save is not None:
         return _save(settings.save, settings)
     if settings.repeats < 1 or settings.threads < 0:
         raise XrgsError("repeats must be at least 1 and threads at least 0")
+    if not 0 <= settings.seed < _SEEDS:
+        raise XrgsError(f"seed={settings.seed}: must be 0 to 2^63 - 1")
     counts = sorted({1, settings.threads or usable_cores()})
     sizes = SMOKE if settings.smoke else FULL
     load = None if settings.load is None else loads.read(user_path(settings.load))

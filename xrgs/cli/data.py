@@ -113,7 +113,7 @@ def inspect(
 def _variant(words: Sequence[str]) -> Path:
     """Return the folder of the variant that `inspect` shows; build the variant if it is missing."""
     from xrgs import composing
-    from xrgs.cli.overrides import explained, with_quotes
+    from xrgs.cli.overrides import check_no_axis, explained, with_quotes
     from xrgs.sweep import build_variants
 
     first, *others = words
@@ -130,7 +130,9 @@ def _variant(words: Sequence[str]) -> Path:
         is_cell = (folder / IDENTITY).is_file()
         return CellFolder(folder.absolute()).variant().folder if is_cell else folder
     with explained():
-        conf = composing.compose(*with_quotes(words))
+        words = with_quotes(words)
+        check_no_axis(words)
+        conf = composing.compose(*words)
         store = Store(Path(conf.store))
         return store.variants / build_variants.find_or_build(conf, store)
 

@@ -60,10 +60,17 @@ def _path(kind: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Path] | None:
     return PrimitiveConstructorSpec(
         nargs=1,
         metavar="PATH",
-        instance_from_str=lambda words: user_path(words[0]),
+        instance_from_str=lambda words: _given_path(words[0]),
         is_instance=lambda value: isinstance(value, Path),
         str_from_instance=lambda path: [str(path)],
     )
+
+
+def _given_path(text: str) -> Path:
+    """Return the path of an option; ValueError for an empty one, as of an unset variable."""
+    if not text:
+        raise ValueError("is empty; give a path, or leave the option out")
+    return user_path(text)
 
 
 def run(

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import is_dataclass
 from itertools import accumulate, pairwise
+from traceback import walk_tb
 from typing import Any, cast
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -26,6 +27,10 @@ from xrgs.sweep.axes import as_name
 
 #: Hydra's message if a file of the config can't be merged into the others.
 _IN_FILE = re.compile(r"In '([^']+)': \w+ raised while composing config:\n")
+#: OmegaConf's message if something else than keys is given for a key that has keys of its own.
+_NOT_MERGED = re.compile(
+    r"Merge error: \w+ is not a subclass of (?P<type>\w+)\. value: (?P<value>.*)"
+)
 #: Hydra's message for an unknown key of an override.
 _NOT_OVERRIDDEN = re.compile(r"Could not override '([^']+)'")
 #: A quoted text, and a quoted text that is a whole item of a list.
@@ -60,6 +65,12 @@ _FLAGS = frozenset({"dry_run", "fail_fast"})
 _MAX_LISTED = 20
 #: Numbers that may be whole, also as 3e3 or 100.0.
 _WHOLE = re.compile(r"\d+(?:\.\d*)?(?:[eE]\+?\d+)?|\d+\.0*")
+_NUMBER = r"-?\d+(?:\.\d+)?(?:[eE][+-]?\d+)?"
+#: Two numbers as people write a range, and numbers that are separated by other signs than commas.
+_SPAN = re.compile(rf"({_NUMBER})\s*(?:-|–|—|:|\.\.+|\bto\b)\s*({_NUMBER})")
+_SEPARATED = re.compile(rf"{_NUMBER}(?:(?:\s*[;|]\s*|\s+){_NUMBER})+")
+#: The most values that a message lists in the place of a range.
+_FEW = 20
 #: Keys whose values are lists of names.
 _NAMES = frozenset({"variant.test"})
 #: Options of Hydra whose value is a folder, and the option whose value may be left out.
@@ -82,8 +93,26 @@ def explained(hint: str = "") -> Iterator[None]:
         yield
     except (OmegaConfBaseException, HydraException) as error:
         raise XrgsError(f"{_explained(error)}{hint}") from error
-    except (YAMLError, UnicodeDecodeError) as error:
+    except YAMLError as error:  # it names the file
         raise XrgsError(f"a YAML file of the config can't be read: {error}") from error
+    except UnicodeDecodeError as error:
+        file = _file_read(error) or "a YAML file of the config"
+        raise XrgsError(f"{file}: is not in UTF-8, which YAML files must be: {error}") from error
+    except OSError as error:
+        if not (file := _file_read(error)):
+            raise
+        reason = error.strerror or "must have lines KEY: VALUE"  # OmegaConf's own has no number
+        raise XrgsError(f"{file}: {reason}") from error
+
+
+def _file_read(error: Exception) -> str:
+    """Return the file that Hydra was reading when an error was raised; empty if it was none.
+
+    The error itself does not know it.
+    """
+    calls = (frame for frame, _ in walk_tb(error.__traceback__))
+    reading = (call.f_locals for call in calls if call.f_code.co_name == "load_config")
+    return next((str(local["full_path"]) for local in reading if "full_path" in local), "")
 
 
 def _explained(error: Exception) -> str:
@@ -116,14 +145,18 @@ def _malformed(word: str, message: str) -> str:
     key, equals, value = word.partition("=")
     if not equals:
         return f"{word}: write KEY=VALUE, as seed=1; one folder of photographs is taken"
+    if not _parsed(f"{key}=1"):
+        return f"{word}: there is no such key{did_you_mean(key.lstrip('+~'), config.known_keys())}"
     call = _CALL.search(message)
     whole, name, inside = call.group("call", "name", "inside") if call else ("", "", "")
     axis = inside if inside.endswith(")") else whole
+    is_wrapped = value[:1] == "(" or "(" not in value  # and no function, as choice()
     candidates = (
         ("a comma has no value beside it", _LONE_COMMA.sub("", value)),
         ("there is one = too many", value.lstrip("=")),
         ("a bracket is not closed", value + _closing(value)),
-        ("axes are not in brackets", value[1:-1] if value[:1] + value[-1:] == "()" else value),
+        ("a bracket is not opened", _opened(key, value)),
+        ("axes are not in brackets", value.strip("()") if is_wrapped else value),
         (f"{name}(...) takes values, and no axis", value.replace(whole, axis)),
     )
     for why, meant in candidates:
@@ -148,15 +181,40 @@ def _closing(text: str) -> str:
     return "".join(reversed(still_open))
 
 
+def _lacks_bracket(text: str) -> bool:
+    """Return whether a text begins or ends with a bracket that has no other one."""
+    depth = sum(_DEPTH.get(sign, 0) for sign in _QUOTED.sub("", text))
+    return (depth > 0 and text[0] in "[(") or (depth < 0 and text[-1] in ")]")
+
+
+def _opened(key: str, text: str) -> str:
+    """Return a text with a bracket for the one that closes it; without that, if no list is meant.
+
+    Only names of files of a group may be a list.
+    """
+    if text[-1:] != "]" or text[:1] == "[":
+        return text
+    return f"[{text}" if key.lstrip("+") in config.GROUPS else text[:-1]
+
+
 def _wrong_file(file: str, error: BaseException) -> str:
     """Return the message on a file of the config that can't be merged into the others."""
     group = file.partition("/")[0]
     key = str(getattr(error, "full_key", ""))
     if key not in config.types_of(config.Conf) and (key == group or key.startswith("_")):
         reason = "its first line must be `# @package _global_`"
+    elif "DictConfig with ListConfig" in str(error):
+        reason = "is a list; it must have lines KEY: VALUE"
+    elif match := _NOT_MERGED.match(str(error)):
+        keys = [k for k in config.known_keys() if _type_name(k) == match["type"]]
+        reason = f"{' or '.join(keys)}: takes keys of its own, and not {match['value']}"
     else:
         reason = _explained(error) if isinstance(error, Exception) else str(error)
     return f"{file}.yaml: {reason}"
+
+
+def _type_name(key: str) -> str:
+    return str(getattr(_type_of(key), "__name__", ""))
 
 
 def _missing_file(file: str, options: Sequence[str]) -> str:
@@ -217,7 +275,8 @@ def with_quotes(words: Sequence[str]) -> list[str]:
     names is `[a,b]`, or `a,b`; `[a,b],[c]` is an axis of two lists. Values of other keys stay.
 
     Raises:
-        XrgsError: A word is not valid Unicode.
+        XrgsError: A word is not valid Unicode, gives no path, or has several numbers that are not
+            an axis of Hydra's grammar; the message has the correction.
     """
     for word in words:
         if not word.isascii() and word.encode(errors="replace").decode() != word:
@@ -228,12 +287,16 @@ def with_quotes(words: Sequence[str]) -> list[str]:
 def _with_quotes(word: str) -> str:
     signed, _, value = word.partition("=")
     key = signed.lstrip("+")
+    if not value and key in config.PATHS:  # as store=$STORE without the variable
+        raise XrgsError(f"{word}: is empty; give a path, or leave it out")
     if not value:
         return word
     if key in _NAMES:
         quoted = _quoted_lists(value)
     elif value[0] in "'\"" and _parsed(word):
         quoted = value
+    elif key in config.GROUPS and _lacks_bracket(value):
+        quoted = value  # Hydra's grammar refuses it, and `explained` says which bracket is missing
     elif key in config.GROUPS:
         quoted = ",".join(_quoted_choice(key, part) for part in _parts(value))
     elif key == "scene.name":
@@ -241,19 +304,68 @@ def _with_quotes(word: str) -> str:
     elif key in config.PATHS:
         parts = value.split(",") if key == "scene.path" and not _exists(value) else [value]
         quoted = ",".join(_quoted_path(key, part) for part in parts)
-    elif _is_whole_number(key):
-        quoted = ",".join(map(_whole, value.split(",")))
+    elif (kind := _type_of(key)) in (int, float, int | None, float | None):
+        _check_numbers(signed, value, is_whole=kind in (int, int | None))
+        quoted = ",".join(map(_whole, value.split(","))) if kind is int else value
     else:
         quoted = value
     return f"{signed}={quoted}"
 
 
-def _is_whole_number(key: str) -> bool:
-    """Return whether the schema's type of a key is int."""
+def _type_of(key: str) -> object:
+    """Return the schema's type of a key; None if it has none."""
     kind: Any = config.Conf
     for name in key.split("."):
         kind = config.types_of(cast("Any", kind)).get(name) if is_dataclass(kind) else None
-    return kind is int
+    return kind
+
+
+def _check_numbers(key: str, value: str, *, is_whole: bool) -> None:
+    """Refuse several numbers in a notation that is not Hydra's, such as `0-3` and `0 1 2`.
+
+    Hydra takes them for a text, and its message does not say how an axis is written.
+
+    Raises:
+        XrgsError: The message has the words to type.
+    """
+    inside = value[1:-1] if value[0] + value[-1] in ("[]", "()", "{}") else value
+    parts = [part.strip() for part in inside.split(",")]
+    spans = [_SPAN.fullmatch(part) for part in parts]
+    if any(spans):
+        raise XrgsError(f"{key}={value}: {_range_meant(key, parts, is_whole=is_whole)}")
+    numbers = inside
+    if all(_SEPARATED.fullmatch(part) or re.fullmatch(_NUMBER, part) for part in parts):
+        numbers = ",".join(number for part in parts for number in re.split(r"[\s;|]+", part))
+    if numbers != inside or (inside != value and "," in inside):
+        raise XrgsError(
+            f"{key}={value}: several values have commas between them, and no brackets; write"
+            f" {key}={numbers}"
+        )
+
+
+def _range_meant(key: str, parts: Sequence[str], *, is_whole: bool) -> str:
+    """Return how to write values among which are ranges in people's notation, as `0-3`."""
+    written_out = [_written_out(part) if is_whole else [] for part in parts]
+    values = [value for some in written_out for value in some]
+    if not all(written_out) or not 1 < len(values) <= _FEW:
+        begin = parts[0] if not (span := _SPAN.fullmatch(parts[0])) else span[1]
+        example = shlex.quote(f"{key}=range({begin},END,STEP)")
+        return f"a range is written as {example}, and END is not in it"
+    meant = f"{key}={','.join(values)}"
+    if len(parts) > 1:
+        return f"write {meant}"
+    as_range = shlex.quote(f"{key}=range({values[0]},{int(values[-1]) + 1})")
+    return f"a range is written as {meant} or {as_range}"
+
+
+def _written_out(part: str) -> list[str]:
+    """Return the whole numbers of a range such as `0-3`, or a number; empty for anything else."""
+    match = _SPAN.fullmatch(part)
+    ends = match.groups() if match else (part, part)
+    if not all(re.fullmatch(r"-?\d+", end) for end in ends):
+        return []
+    first, last = map(int, ends)
+    return [str(value) for value in range(first, min(last, first + _FEW) + 1)]
 
 
 def _whole(text: str) -> str:
@@ -363,6 +475,26 @@ def check_words(words: Sequence[str]) -> None:
         before = word
 
 
+def replaced_words(words: Sequence[str]) -> list[str]:
+    """Return a line on each key that is given several values by several words.
+
+    Hydra takes the last word of a key, as for a script that has defaults before `"$@"`. A shell
+    makes such words of `seed={0..3}`, and then an axis was meant.
+    """
+    given: dict[str, list[str]] = {}
+    for word in words:
+        key, is_assignment, value = word.partition("=")
+        if is_assignment and not key.startswith(("-", "~")):
+            given.setdefault(key.lstrip("+"), []).append(value)
+    different = {key: [*dict.fromkeys(values)] for key, values in given.items()}
+    return [
+        f"{key} is given {len(given[key])} times, and {key}={given[key][-1]} replaces the others;"
+        f" for all of them write {shlex.quote(f'{key}=' + ','.join(values))}"
+        for key, values in different.items()
+        if len(values) > 1
+    ]
+
+
 def _meant(word: str, before: str) -> str:
     """Return the message about a word that is neither KEY=VALUE nor an option."""
     if "=" in before and (before.endswith((",", "[")) or word.startswith((",", "]"))):
@@ -378,7 +510,7 @@ def _meant(word: str, before: str) -> str:
 
 
 def check_no_axis(words: Sequence[str]) -> None:
-    """Refuse overrides with several values, since one cell is trained.
+    """Refuse overrides with several values, where one config is composed.
 
     Raises:
         XrgsError: An override is an axis; the message names it.

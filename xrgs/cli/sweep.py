@@ -15,7 +15,14 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 
 from xrgs import config
 from xrgs.cli.options import answer_version, errors_as_messages
-from xrgs.cli.overrides import check_words, explained, files, with_options_first, with_quotes
+from xrgs.cli.overrides import (
+    check_words,
+    explained,
+    files,
+    replaced_words,
+    with_options_first,
+    with_quotes,
+)
 from xrgs.composing import escape_interpolations
 from xrgs.errors import XrgsError, did_you_mean
 from xrgs.runtime.machine import end_quickly
@@ -107,6 +114,8 @@ def main() -> None:
         sys.exit(2)
     with errors_as_messages("xrgs-sweep"):
         check_words(arguments)
+    for line in replaced_words(arguments):
+        say(line, sys.stderr)
     # Hydra requires a plus before these groups, which is easily forgotten.
     words = ["+" + w if w.partition("=")[0] in config.PLUS_GROUPS else w for w in arguments]
     run("xrgs-sweep", words, "Finished cells are kept: run the same command again to continue.")

@@ -204,7 +204,9 @@ def _place(words: _Words) -> _Placed | None:
     photographs = scenes.names(conf.scene, conf.variant.long_side)
     kind = _kind(conf)
     _say(f"{name}: {counted(len(photographs), kind)} found")
-    if not conf.dry_run:
+    if conf.dry_run:
+        store.check_room()
+    else:
         store.prepare()
     (planned,) = build_variants.plan([conf], store, allow_build=not conf.dry_run)
     if planned.error:

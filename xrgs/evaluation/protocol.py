@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from xrgs.evaluation.metrics import score_view
 from xrgs.photos import images
-from xrgs.runtime.machine import single_torch_thread, wait_for_gpu
+from xrgs.runtime.machine import torch_threads, wait_for_gpu
 from xrgs.runtime.progress import progress
 
 if TYPE_CHECKING:
@@ -134,7 +134,7 @@ def _score(
     import torch
 
     image = _render(gaussians, view, conf).clamp(0.0, 1.0).cpu()
-    with torch.no_grad(), single_torch_thread():  # the last digit of sums depends on threads
+    with torch.no_grad(), torch_threads(1):  # the last digit of sums depends on threads
         scores = score_view(image, view.image, view.mask, masked=masked)
     return image, scores
 
@@ -150,5 +150,5 @@ def score_file(render: Path, view: View, *, masked: bool) -> dict[str, float | N
     size = view.width, view.height
     image, target = (torch.from_numpy(images.read_png(file, size)) for file in (render, view.file))
     mask = torch.from_numpy(images.read_mask(view.mask, size)) if view.mask else None
-    with torch.no_grad(), single_torch_thread():
+    with torch.no_grad(), torch_threads(1):
         return score_view(image, target, mask, masked=masked)

@@ -13,6 +13,9 @@ from xrgs.safeio.files import list_names
 _AS_COLMAP = "export the cameras in COLMAP's format from the program that made it"
 _UNPACK = "unpack it, and give the folder"
 _FOLDER = "give the folder that it is in"
+#: The suffix of COLMAP's databases, their usual name, and the first bytes of an SQLite database.
+#: Windows writes Thumbs.db into folders of photographs, which is none.
+_DATABASE, _DATABASE_NAME, _SQLITE = ".db", "database.db", b"SQLite format 3\0"
 #: End of a file's name, in lower case -> what the file is, and what to do with it.
 _ENDINGS = {
     **dict.fromkeys((".zip", ".7z", ".rar", ".tar", ".tgz", ".gz", ".xz"), ("an archive", _UNPACK)),
@@ -25,7 +28,7 @@ _ENDINGS = {
     **dict.fromkeys((".abc", ".fbx"), ("a scene of an animation program", _AS_COLMAP)),
     ".csv": ("a table", _AS_COLMAP),
     ".npy": ("an array of numpy, as LLFF's poses_bounds.npy is", _AS_COLMAP),
-    ".db": ("COLMAP's database, which has no poses", "give the folder of its model, sparse/0"),
+    _DATABASE: ("COLMAP's database, which has no poses", "give the folder of its model, sparse/0"),
     ".ply": ("a file of points, which has no cameras", _FOLDER),
     **dict.fromkeys((".bin", ".txt"), ("one file", _FOLDER)),
 }
@@ -39,23 +42,39 @@ _KEYS = {
 
 
 def kind(file: Path) -> str:
-    """Describe a file by the end of its name, such as `an archive`; empty if the end is unknown."""
-    return next((w for end, (w, _) in _ENDINGS.items() if file.name.lower().endswith(end)), "")
+    """Describe a file of another program, such as `an archive`; empty if it is unknown."""
+    return next((what for end, (what, _) in _ENDINGS.items() if _ends(file, end)), "")
 
 
 def check_file(file: Path) -> None:
-    """Raise XrgsError for a file that can't be a transforms.json, by the end of its name."""
+    """Raise XrgsError for a file of another program, which can't be a transforms.json."""
     for ending, (what, todo) in _ENDINGS.items():
-        if file.name.lower().endswith(ending):
+        if _ends(file, ending):
             raise XrgsError(
                 f"it is {what}, and not a folder of COLMAP's or a transforms.json; {todo}"
             )
 
 
+def _ends(file: Path, ending: str) -> bool:
+    """Return whether a file's name ends so, and a database is one of COLMAP's."""
+    name = file.name.lower()
+    if ending != _DATABASE or name == _DATABASE_NAME:
+        return name.endswith(ending)
+    return name.endswith(ending) and _is_sqlite(file)
+
+
+def _is_sqlite(file: Path) -> bool:
+    try:
+        with file.open("rb") as stream:
+            return stream.read(len(_SQLITE)) == _SQLITE
+    except OSError:
+        return False
+
+
 def in_folder(folder: Path) -> str:
     """Name a folder's files of other programs, as the end of a message; empty if it has none."""
-    endings = tuple(ending for ending in _ENDINGS if ending not in (".bin", ".txt", ".ply", ".csv"))
-    found = [name for name in list_names(folder) if name.lower().endswith(endings)]
+    endings = [ending for ending in _ENDINGS if ending not in (".bin", ".txt", ".ply", ".csv")]
+    found = [name for name in list_names(folder) if any(_ends(folder / name, e) for e in endings)]
     return f"; {listed(found)} can't be read: {_AS_COLMAP}" if found else ""
 
 

@@ -9,7 +9,7 @@ import os
 import resource
 import sys
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path, PurePosixPath
 
@@ -190,11 +190,6 @@ def torch_threads(count: int) -> Iterator[int]:
         yield threads
     finally:
         torch.set_num_threads(threads)
-
-
-def single_torch_thread() -> AbstractContextManager[int]:
-    """Limit torch to one thread during a block; yield the number before and after it."""
-    return torch_threads(1)
 
 
 #: Two readings of a process's start may differ by less than this many seconds: boot times are

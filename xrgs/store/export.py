@@ -7,6 +7,7 @@ camera. Gaussians of a cell that no render shows are left out.
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -121,6 +122,14 @@ def check_place(out: Path, form: str) -> None:
         raise XrgsError(f"out={out}: is not empty; name a new folder")
     elif out.exists() and not out.is_dir():
         raise XrgsError(f"out={out}: is a file; name a new folder")
+    # A training of hours may come before the export.
+    folder = (out.parent if form in SPLAT_FORMATS else out).absolute()
+    while not folder.exists() and not folder.is_symlink():
+        folder = folder.parent
+    try:
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise XrgsError(f"out={out}: can't be written: {folder}: {error.strerror}") from error
 
 
 def without_invisible(gaussians: Gaussians, alpha_min: float) -> Gaussians:

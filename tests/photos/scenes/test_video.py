@@ -269,6 +269,55 @@ def test_too_few_frames_no_video_and_no_package_are_named(
         scenes.fingerprint(conf(tmp_path / "a.mp4", 2))
 
 
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [
+        (b"twelve bytes", r"unreadable as a video"),
+        (b"", r"unreadable as a video"),
+        ("large", r"its frames have 192 x 64 pixels, too many"),
+        ("sound", r"it has no video"),
+    ],
+)
+def test_a_file_that_cannot_be_a_video_is_named_before_frames_are_taken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: bytes | str, why: str
+) -> None:
+    """As in a dry run, which asks for names, and with the words of the reader."""
+    file = tmp_path / "a.mkv"
+    if isinstance(content, bytes):
+        file.write_bytes(content)
+    elif content == "sound":
+        with av.open(str(file), "w") as container:
+            stream = container.add_stream("pcm_s16le", rate=8000)
+            sound = av.AudioFrame.from_ndarray(np.zeros((1, 800), np.int16), "s16", "mono")
+            sound.rate = 8000
+            container.mux(stream.encode(sound))
+            container.mux(stream.encode(None))
+    else:
+        write_video(file, [textured(9, 0)] * 2, aspect=Fraction(2))
+        monkeypatch.setattr(images, "MAX_PIXELS", WIDTH * HEIGHT)
+    with pytest.raises(XrgsError, match=rf"a\.mkv: {why}") as refused:
+        scenes.names(conf(file, 2))
+    with pytest.raises(XrgsError) as read:
+        video.extract(file, ["frame_0000", "frame_0001"], tmp_path)
+    assert str(read.value) == str(refused.value)
+
+
+def test_names_are_of_the_first_frames_and_not_of_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_video(tmp_path / "a.mp4", [textured(10 * i, 0) for i in range(20)])
+    decoded: list[int] = []
+    square = video._square
+
+    def counted(width: int, height: int, aspect: Fraction) -> tuple[int, int]:
+        decoded.append(width)
+        return square(width, height, aspect)
+
+    monkeypatch.setattr(video, "_square", counted)
+    assert scenes.names(conf(tmp_path / "a.mp4", 3)) == ["frame_0000", "frame_0001", "frame_0002"]
+    assert decoded == [WIDTH]
+
+
 def test_a_truncated_video_gives_the_frames_that_it_has(tmp_path: Path) -> None:
     write_video(tmp_path / "a.avi", [textured(10 * i, 0) for i in range(20)])
     content = (tmp_path / "a.avi").read_bytes()

@@ -24,7 +24,7 @@ from torch.nn.functional import avg_pool2d, grid_sample
 
 from xrgs.photos import images
 from xrgs.photos.scenes.scene import bundled_photograph
-from xrgs.runtime.machine import single_torch_thread
+from xrgs.runtime.machine import torch_threads
 from xrgs.runtime.progress import progress
 
 _NEAR = 0.05
@@ -312,7 +312,7 @@ def render_views(
         images.save(folder / f"{name}.png", image.numpy(), durable=False)
 
     # One thread per view, and none within: on a busy machine torch's threads wait for each other.
-    with single_torch_thread() as threads, ThreadPoolExecutor(threads) as pool:
+    with torch_threads(1) as threads, ThreadPoolExecutor(threads) as pool:
         done = pool.map(render_view, viewmats)
         for _ in progress(done, "rendering the scene", "view", len(viewmats)):
             pass

@@ -15,7 +15,7 @@ compares the lines of each frame with its neighbours, and marks those of two fie
 from __future__ import annotations
 
 import logging
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import partial
@@ -38,7 +38,7 @@ from xrgs.safeio.paths import user_path
 from xrgs.safeio.sanitize import for_line
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 
     from av.container import InputContainer
     from av.filter.graph import Graph
@@ -85,8 +85,21 @@ class VideoScene:
     """Returns the digest of the code of a kind of scenes."""
 
     def names(self, conf: SceneConf, long_side: int) -> list[str]:  # noqa: ARG002
-        """Return the names of the frames: `frame_0000`, `frame_0001`, ..."""
+        """Return the names of the frames: `frame_0000`, `frame_0001`, ...
+
+        The first frames are decoded, so that a dry run refuses what is not a video. `digest` names
+        a missing file or package.
+
+        Raises:
+            ImageError: The file is not a video, or not one that can be taken, see `extract`.
+            XrgsError: It has no frame, or `scene.views` is below two.
+        """
         check_views(conf)
+        file = _file(conf.path)
+        if file.is_file() and find_spec("av") is not None:
+            with closing(_frames(file)) as frames:
+                if next(frames, None) is None:
+                    raise _too_few(file, 0, conf.views)
         return [f"frame_{index:04d}" for index in range(conf.views)]
 
     def digest(self, conf: SceneConf, long_side: int) -> str:  # noqa: ARG002
@@ -167,9 +180,7 @@ def extract(file: Path, names: Sequence[str], folder: Path) -> None:
             sharpness.append(measure_sharpness(_brightness(frame.decoded)))
             bar.update(1)
     if len(sharpness) < len(names):
-        raise XrgsError(
-            f"scene.views={len(names)}: {file} has {len(sharpness)} frames; lower scene.views"
-        )
+        raise _too_few(file, len(sharpness), len(names))
     chosen = dict(zip(sharpest(sharpness, len(names)), names, strict=True))
     with ProgressBar("frames", "frame", len(names)) as bar:
         for number, frame in enumerate(_frames(file)):
@@ -182,6 +193,10 @@ def extract(file: Path, names: Sequence[str], folder: Path) -> None:
                     )
                 images.save(folder / f"{chosen[number]}.png", image, durable=False)
                 bar.update(1)
+
+
+def _too_few(file: Path, frames: int, views: int) -> XrgsError:
+    return XrgsError(f"scene.views={views}: {file} has {frames} frames; lower scene.views")
 
 
 def sharpest(sharpness: list[float], parts: int) -> list[int]:
@@ -200,7 +215,7 @@ def measure_sharpness(brightness: NDArray[np.uint8]) -> float:
     return float(laplace(brightness.astype(np.float32)).var())
 
 
-def _frames(file: Path) -> Iterator[_Frame]:
+def _frames(file: Path) -> Generator[_Frame, None, None]:
     """Decode the frames of the first video stream.
 
     Data that can't be decoded end the video with a warning; before the first frame, with an error.

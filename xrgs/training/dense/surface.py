@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from xrgs.runtime.machine import single_torch_thread
+from xrgs.runtime.machine import torch_threads
 from xrgs.runtime.progress import progress
 from xrgs.training.dense.depths import (
     DepthMap,
@@ -150,7 +150,7 @@ def find_depths(
     """
     planes = choose_planes(views, points)
     # Views run in parallel, each on one thread, so that the bits do not depend on the thread count.
-    with single_torch_thread() as threads, ThreadPoolExecutor(threads) as pool:
+    with torch_threads(1) as threads, ThreadPoolExecutor(threads) as pool:
         swept = pool.map(lambda number: sweep(views, planes[number], number, backend), planes)
         found = dict(zip(planes, progress(swept, "dense start", "view", len(planes)), strict=True))
         for check in (consistent, not_seen_through):
