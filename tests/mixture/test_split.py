@@ -118,7 +118,7 @@ def test_an_hr_view_is_a_whole_number_of_lr_pixels_and_never_enlarged(
     conf = configured(long_side=side, factor=factor)
     shrink = min(1, (side or max(width, height)) / max(width, height))
     if min(round(width * shrink), round(height * shrink)) // factor < WINDOW:
-        with pytest.raises(XrgsError, match=r"variant\.factor"):
+        with pytest.raises(XrgsError, match="smaller than the SSIM window"):
             hr_geometry((width, height), shrink_factor([(width, height)], conf.long_side), conf)
         return
     made = hr_geometry((width, height), shrink_factor([(width, height)], conf.long_side), conf)
@@ -225,3 +225,5 @@ def test_a_uniform_selection_is_evenly_spaced(configured: Make) -> None:
 def test_a_factor_too_large_for_the_ssim_window_is_named(configured: Make) -> None:
     with pytest.raises(XrgsError, match=r"variant\.factor=40: LR views of 12x9 px .*SSIM window"):
         hr_geometry((504, 378), 1.0, configured(factor=40))
+    with pytest.raises(XrgsError, match=r"^views of 9x10 px are smaller than the SSIM window"):
+        hr_geometry((9, 10), 1.0, configured(factor=1))

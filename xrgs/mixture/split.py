@@ -279,9 +279,9 @@ def hr_geometry(size: tuple[int, int], shrink: float, conf: VariantConf) -> HrGe
             helps.append(f"lower variant.factor to {min(resized) // SSIM_WINDOW}")
         if shrink < 1 and min(size) // conf.factor >= SSIM_WINDOW:
             helps.append(f"raise variant.long_side={conf.long_side}")
+        views = "views" if conf.factor == 1 else f"variant.factor={conf.factor}: LR views"
         raise TooSmallError(
-            f"variant.factor={conf.factor}: LR views of {lr[0]}x{lr[1]} px are smaller than the"
-            f" SSIM window of {SSIM_WINDOW} px",
+            f"{views} of {lr[0]}x{lr[1]} px are smaller than the SSIM window of {SSIM_WINDOW} px",
             " or ".join(helps) or "the photograph is too small",
         )
     return HrGeometry(resized, lr[0] * conf.factor, lr[1] * conf.factor)

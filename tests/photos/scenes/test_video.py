@@ -262,6 +262,8 @@ def test_too_few_frames_no_video_and_no_package_are_named(
         scenes.resolve(conf(tmp_path / "list.mp4", 2), tmp_path)
     with pytest.raises(XrgsError, match=r"scene\.path=.*gone\.mp4: No such file"):
         scenes.fingerprint(conf(tmp_path / "gone.mp4", 2))
+    with pytest.raises(XrgsError, match=r"is a folder, and no video; scene=folder takes it"):
+        scenes.fingerprint(conf(tmp_path, 2))
     with pytest.raises(XrgsError, match=r"not a folder; .*scene=video"):
         scenes.fingerprint(scene_conf("folder", tmp_path / "a.mp4"))
     monkeypatch.setattr(video, "find_spec", lambda _: None)

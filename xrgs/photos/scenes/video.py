@@ -163,7 +163,10 @@ def _streams(container: InputContainer) -> list[VideoStream]:
 def _file(path: str | None) -> Path:
     if not path:
         raise XrgsError("scene.path is empty: give the video, scene.path=...")
-    return user_path(path)
+    file = user_path(path)
+    if file.is_dir():
+        raise XrgsError(f"scene.path={file}: is a folder, and no video; scene=folder takes it")
+    return file
 
 
 def extract(file: Path, names: Sequence[str], folder: Path) -> None:
