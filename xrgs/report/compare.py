@@ -159,7 +159,11 @@ def compare(
     _check_comparable(cells, against)
     pairs = _pairs(cells, metrics, against)
     per_scene, means = averaged(pairs, [metric.name for metric in metrics if is_ratio(metric)])
-    gaps_per_scene, gaps = averaged(_gaps(pairs, cells, metrics, against), ())
+    shares = _gaps(pairs, cells, metrics, against)
+    if shares.empty:  # most studies have no all_hr
+        gaps_per_scene, gaps = per_scene.iloc[:0], means.iloc[:0]
+    else:
+        gaps_per_scene, gaps = averaged(shares, ())
     ablations = cells[cells["label"] != against]
     return Comparison(
         design=design,
