@@ -26,6 +26,7 @@ from copy import deepcopy
 from dataclasses import asdict, dataclass, field
 from functools import cache, partial, reduce
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib.util import source_hash
 from operator import getitem
 from pathlib import Path
 from types import CodeType
@@ -57,6 +58,9 @@ settings.load_profile("untimed")
 
 pytest_plugins = ["tests.variant_fixtures"]
 
+#: The name of this process with `-n`, as gw0.
+_WORKER = os.environ.get("PYTEST_XDIST_WORKER", "")
+
 
 def pytest_configure(config: pytest.Config) -> None:
     """Let pytest keep rewritten tests in its own cache where Python may write no bytecode."""
@@ -80,7 +84,7 @@ def _rewritten_once(
         content = kept.read_bytes()
         if content.startswith(header):
             kept_code = marshal.loads(content[len(header) :])  # noqa: S302 - our own
-            return importlib.util.source_hash(source), kept_code
+            return source_hash(source), kept_code
     found, compiled = rewrite_test(file, config)
     # Under its name it is whole: another worker may read it.
     own = kept.with_suffix(f".{os.getpid()}")
@@ -105,18 +109,15 @@ def pytest_collection() -> Generator[None, object, object]:
         gc.enable()
 
 
-class _FromTheEnd(pytest.Dir):
-    """A folder that is collected from its end."""
-
-    def collect(self) -> list[pytest.Item | pytest.Collector]:
-        return list(super().collect())[::-1]
-
-
-def pytest_collect_directory(path: Path, parent: pytest.Collector) -> pytest.Collector | None:
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(
+    collector: pytest.Collector,
+) -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
     """Let every second worker begin at the end: it finds rewritten what another one has read."""
-    if os.environ.get("PYTEST_XDIST_WORKER", "gw0").endswith(("1", "3")):
-        return _FromTheEnd.from_parent(parent, path=path)
-    return None
+    report = yield
+    if isinstance(collector, pytest.Directory) and _WORKER.endswith(("1", "3")):
+        report.result.reverse()
+    return report
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -416,7 +417,7 @@ def forked_command() -> Iterator[Callable[..., tuple[int, str, str]]]:
 def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
     """(name, function of a folder) -> the folder, which the function has made for all workers."""
     home = tmp_path_factory.getbasetemp()
-    if "PYTEST_XDIST_WORKER" in os.environ:
+    if _WORKER:
         home = home.parent
 
     def made(name: str, make: Callable[[Path], object]) -> Path:
