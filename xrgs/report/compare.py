@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -44,6 +45,8 @@ _GROUP = ["label", "condition"]
 _TIMES = frozenset({"s", "ms"})
 #: The columns in which a cell and its base must agree.
 _PAIR = ["scene", "condition", "variant_seed", "seed"]
+#: The columns of a pair that are computed of its two cells.
+_VALUES = ("base", "value", "effect", "why")
 
 
 @dataclass(frozen=True)
@@ -159,7 +162,11 @@ def compare(
     _check_comparable(cells, against)
     pairs = _pairs(cells, metrics, against)
     per_scene, means = averaged(pairs, [metric.name for metric in metrics if is_ratio(metric)])
-    gaps_per_scene, gaps = averaged(_gaps(pairs, cells, metrics, against), ())
+    shares = _gaps(pairs, cells, metrics, against)
+    if shares.empty:
+        gaps_per_scene, gaps = per_scene.iloc[:0], means.iloc[:0]
+    else:
+        gaps_per_scene, gaps = averaged(shares, ())
     ablations = cells[cells["label"] != against]
     return Comparison(
         design=design,
@@ -315,7 +322,7 @@ def _pairs(cells: pd.DataFrame, metrics: Sequence[Metric], against: str) -> pd.D
     cells.loc[reasons.index, "reason"] = f"no {against}: " + reasons
     paired = ablations[usable]
     matched = bases.loc[paired["base_id"]]
-    parts = []
+    columns: dict[str, list[Any]] = {key: [] for key in ("metric", *_VALUES)}
     for metric in metrics:
         base = matched[metric.name].to_numpy(np.float64)
         value = paired[metric.name].to_numpy(np.float64)
@@ -323,11 +330,12 @@ def _pairs(cells: pd.DataFrame, metrics: Sequence[Metric], against: str) -> pd.D
         incomparable, reason = _incomparable(metric, paired, matched)
         effect = np.where(incomparable, np.nan, effect)
         why = np.where(incomparable & (why == ""), reason, why)
-        part = paired[[*_GROUP, "scene", "variant_seed", "seed", "cell_id", "base_id"]]
-        parts.append(
-            part.assign(metric=metric.name, base=base, value=value, effect=effect, why=why)
-        )
-    return pd.concat(parts, ignore_index=True)
+        columns["metric"] += [metric.name] * len(paired)
+        for name, of in zip(_VALUES, (base, value, effect, why), strict=True):
+            columns[name] += of.tolist()
+    keys = paired[[*_GROUP, "scene", "variant_seed", "seed", "cell_id", "base_id"]]
+    pairs = pd.concat([keys] * len(metrics), ignore_index=True).assign(**columns)
+    return pairs.astype({"metric": str, "why": str})  # if there are none too
 
 
 def _incomparable(
@@ -347,6 +355,8 @@ def _gaps(
     """Return the pairs of scores in conditions with all_hr; `effect` is the share of the gap, %."""
     scores = {m.name: m.higher_is_better for m in metrics if m.score is not None}
     conditions = cells.loc[cells["label"].isin({ALL_HR} - {against}), "condition"].unique()
+    if not conditions.size:  # as in most studies
+        return pairs.iloc[:0]
     rows = pairs[pairs["metric"].isin(scores) & pairs["condition"].isin(conditions)]
     replicate = ["condition", "base_id", "metric"]
     comparable = rows[rows["why"] != OTHER_CODE]

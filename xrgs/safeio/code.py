@@ -75,17 +75,14 @@ class CodeFolders:
     def needed_by(self, files: Iterable[Path]) -> dict[str, Path]:
         """Return the parts that files of any package import, and what these need, by name."""
         core = {*self.core()}
-        imported = {name for file in files for name in _imported(file)} - core
-        parts = {name for name in imported if _is_in(name, self.folders_of_parts)}
+        parts = {n for file in files for n in _imported(file, self.folders_of_parts)} - core
         return {name: PACKAGE / name for name in self._with_imports(parts, core | self.registries)}
 
     def _with_imports(self, files: set[str], end: Iterable[str]) -> set[str]:
         """Add all files of `folders_of_parts` that files import, but for those of `end`."""
         files, pending = set(files), list(files)
         while pending:
-            imported = {
-                n for n in _imported(PACKAGE / pending.pop()) if _is_in(n, self.folders_of_parts)
-            }
+            imported = _imported(PACKAGE / pending.pop(), self.folders_of_parts)
             pending += imported - files - {*end}
             files |= imported - {*end}
         return files
@@ -95,12 +92,17 @@ def _is_in(name: str, folders: Iterable[str]) -> bool:
     return any(name.startswith(f"{folder}/") for folder in folders)
 
 
-def _imported(file: Path) -> set[str]:
-    """Return the files of this package that a file imports, if only for types."""
+def _imported(file: Path, folders: Iterable[str]) -> set[str]:
+    """Return the files below these folders that a file imports, if only for types."""
     if file.suffix != ".py":
         return set()
-    imported = {_file_of(dotted) for dotted in _own_imports(file, file.stat().st_mtime_ns)}
-    return {name for name in imported if name is not None}
+    packages = [f"{_NAME}.{folder.replace('/', '.')}." for folder in folders]
+    imported = {
+        _file_of(dotted)
+        for dotted in _own_imports(file, file.stat().st_mtime_ns)
+        if any(f"{dotted}.".startswith(package) for package in packages)
+    }
+    return {name for name in imported if name is not None and _is_in(name, folders)}
 
 
 def _file_of(dotted: str) -> str | None:
