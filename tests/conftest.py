@@ -5,11 +5,9 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import gc
-import hashlib
 import importlib
 import io
 import json
-import marshal
 import os
 import pickle
 import re
@@ -26,16 +24,13 @@ from copy import deepcopy
 from dataclasses import asdict, dataclass, field
 from functools import cache, partial, reduce
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from importlib.util import source_hash
 from operator import getitem
 from pathlib import Path
-from types import CodeType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 import yaml
-from _pytest.assertion import rewrite
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hypothesis import HealthCheck, settings
 
@@ -58,40 +53,6 @@ settings.load_profile("untimed")
 
 pytest_plugins = ["tests.variant_fixtures"]
 
-#: The name of this process with `-n`, as gw0.
-_WORKER = os.environ.get("PYTEST_XDIST_WORKER", "")
-
-
-def pytest_configure(config: pytest.Config) -> None:
-    """Let pytest keep rewritten tests in its own cache where Python may write no bytecode."""
-    if sys.dont_write_bytecode and hasattr(config, "cache"):
-        folder = config.cache.mkdir("rewritten")
-        rewrite._rewrite_test = partial(_rewritten_once, rewrite._rewrite_test, folder)
-
-
-def _rewritten_once(
-    rewrite_test: Callable[[Path, pytest.Config], tuple[bytes, CodeType]],
-    folder: Path,
-    file: Path,
-    config: pytest.Config,
-) -> tuple[bytes, CodeType]:
-    """Return the hash of a file's source, and its code with asserts that tell their values."""
-    source = file.read_bytes()
-    header = hashlib.sha256(source).digest()
-    place = hashlib.sha256(str(file).encode()).hexdigest()
-    kept = folder / f"{file.stem}-{place[:16]}{rewrite.PYC_TAIL}"
-    with suppress(OSError):
-        content = kept.read_bytes()
-        if content.startswith(header):
-            kept_code = marshal.loads(content[len(header) :])  # noqa: S302 - our own
-            return source_hash(source), kept_code
-    found, compiled = rewrite_test(file, config)
-    # Under its name it is whole: another worker may read it.
-    own = kept.with_suffix(f".{os.getpid()}")
-    own.write_bytes(header + marshal.dumps(compiled))
-    own.replace(kept)
-    return found, compiled
-
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Generator[None, object, object]:
@@ -109,29 +70,18 @@ def pytest_collection() -> Generator[None, object, object]:
         gc.enable()
 
 
-@pytest.hookimpl(wrapper=True)
-def pytest_make_collect_report(
-    collector: pytest.Collector,
-) -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
-    """Let every second worker begin at the end: it finds rewritten what another one has read."""
-    report = yield
-    if isinstance(collector, pytest.Directory) and _WORKER.endswith(("1", "3")):
-        report.result.reverse()
-    return report
-
-
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark exhaustive tests as slow too, and put files with slow tests first.
 
     `-m "not slow"` replaces the `-m` of pyproject.toml. With `-n`, one worker runs a file: a long
-    one at the end would leave the other workers idle. All workers need the same order.
+    one at the end would leave the other workers idle.
     """
     for item in items:
         if item.get_closest_marker("exhaustive"):
             item.add_marker("slow")
     slow = {item.path for item in items if item.get_closest_marker("slow")}
-    items.sort(key=lambda item: (item.path not in slow, item.path))
+    items.sort(key=lambda item: item.path not in slow)
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -417,7 +367,7 @@ def forked_command() -> Iterator[Callable[..., tuple[int, str, str]]]:
 def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
     """(name, function of a folder) -> the folder, which the function has made for all workers."""
     home = tmp_path_factory.getbasetemp()
-    if _WORKER:
+    if "PYTEST_XDIST_WORKER" in os.environ:
         home = home.parent
 
     def made(name: str, make: Callable[[Path], object]) -> Path:
