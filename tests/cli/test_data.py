@@ -229,7 +229,7 @@ def test_files_of_gaussians_are_converted(xrgs_data: XrgsData, tmp_path: Path) -
         (["a.b.ply", "--format", "glb", "--out", "."], "--out .: "),
         (["a.b.ply", "--out", "x.obj"], "--out x.obj: a file ends with .ply, .glb, .spz"),
         (["a.b.ply", "--out", "x.ply", "--format", "colmap"], "--out x.ply: --format colmap"),
-        (["a.b.ply", "--out", "a.b.ply/x.glb"], "--out a.b.ply/x.glb: File exists"),
+        (["a.b.ply", "--out", "a.b.ply/x.glb"], "a.b.ply: Not a directory"),
         (["none.ply", "--format", "glb"], "none.ply: cannot be read"),
         (["a.b.ply"], "a.b.ply: Not a directory; give the folder"),
     ):
