@@ -36,6 +36,7 @@ from xrgs.mixture.views import Reconstruction, SceneFailed, Variant, View
 from xrgs.photos import images
 from xrgs.photos.lens import Lens
 from xrgs.photos.scenes import Scene
+from xrgs.runtime.machine import on_threads
 from xrgs.runtime.progress import progress
 from xrgs.runtime.text import listed
 from xrgs.safeio.atomic import write_text
@@ -362,23 +363,31 @@ def _write_undistorted(
     test = [("test", i, "HR") for i in (split.test or range(len(photos)))]
     original = [("original", i, "HR") for i in sorted(degraded)]
     registered = [entry for entry in (*train, *test, *original) if entry[1] in model.viewmats]
-    views, rates, hidden = [], [], []
-    for part, i, tag in progress(registered, "undistorting", "view"):
+
+    def write(entry: tuple[str, int, str]) -> View | None:
+        part, i, tag = entry
         kind, name = "lr" if part == "train" and i in degraded else "hr", photos.names[i]
         width, height = photos.size(kind, i)
         lens = model.lenses[i].resized(width, height)
         image, used = photos.undistorted(kind, i, lens)
         if used is not None and not used.any():
-            hidden.append(f"{name} ({part})")
-            continue
+            return None
         file = out / "images" / part / f"{name}.png"
         mask = None if used is None else out / "images" / f"{part}-masks" / f"{name}.png"
         images.save(file, image, durable=False)  # `freeze` syncs all
         if used is not None and mask is not None:
             images.save_mask(mask, used, durable=False)
         K = lens.undistorted().K
-        views.append(View(name, file, part, tag, width, height, K, model.viewmats[i], 1.0, mask))
-        rates.append(sampling_rate.sampling_rate(K, depths[i]))
+        return View(name, file, part, tag, width, height, K, model.viewmats[i], 1.0, mask)
+
+    written = progress(on_threads(write, registered), "undistorting", "view", len(registered))
+    views, rates, hidden = [], [], []
+    for (part, i, _), view in zip(registered, written, strict=True):
+        if view is None:
+            hidden.append(f"{photos.names[i]} ({part})")
+        else:
+            views.append(view)
+            rates.append(sampling_rate.sampling_rate(view.K, depths[i]))
     rhos = sampling_rate.relative_to_largest(rates)
     notes = [f"views left out, whose masks leave no pixel: {listed(hidden)}"] if hidden else []
     views = [replace(view, sampling_rate=rho) for view, rho in zip(views, rhos, strict=True)]

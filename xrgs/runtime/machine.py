@@ -8,12 +8,16 @@ import math
 import os
 import resource
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path, PurePosixPath
+from typing import TypeVar
 
 import psutil
+
+_In, _Out = TypeVar("_In"), TypeVar("_Out")
 
 
 def usable_cores() -> int:
@@ -190,6 +194,16 @@ def torch_threads(count: int) -> Iterator[int]:
         yield threads
     finally:
         torch.set_num_threads(threads)
+
+
+def on_threads(function: Callable[[_In], _Out], items: Iterable[_In]) -> Iterator[_Out]:
+    """Yield `function(item)` of each item, in order. Several items are in work, one per thread.
+
+    There are as many threads as torch has, and torch has one within each. So no bit depends on the
+    number of threads, and on a busy machine torch's threads do not wait for each other.
+    """
+    with torch_threads(1) as threads, ThreadPoolExecutor(threads) as pool:
+        yield from pool.map(function, items)
 
 
 #: Two readings of a process's start may differ by less than this many seconds: boot times are

@@ -12,7 +12,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,7 +23,7 @@ from torch.nn.functional import avg_pool2d, grid_sample
 
 from xrgs.photos import images
 from xrgs.photos.scenes.scene import bundled_photograph
-from xrgs.runtime.machine import torch_threads
+from xrgs.runtime.machine import on_threads
 from xrgs.runtime.progress import progress
 
 _NEAR = 0.05
@@ -311,11 +310,9 @@ def render_views(
         image = render(scene, pyramids, torch.from_numpy(K), pose, *size, SUPERSAMPLE)
         images.save(folder / f"{name}.png", image.numpy(), durable=False)
 
-    # One thread per view, and none within: on a busy machine torch's threads wait for each other.
-    with torch_threads(1) as threads, ThreadPoolExecutor(threads) as pool:
-        done = pool.map(render_view, viewmats)
-        for _ in progress(done, "rendering the scene", "view", len(viewmats)):
-            pass
+    done = on_threads(render_view, viewmats)
+    for _ in progress(done, "rendering the scene", "view", len(viewmats)):
+        pass
 
 
 def _pyramid(photograph: str, tint: tuple[float, float, float]) -> Pyramid:

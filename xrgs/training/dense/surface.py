@@ -6,14 +6,13 @@ A quadtree of each photograph has large squares where it is smooth, and small on
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from xrgs.runtime.machine import torch_threads
+from xrgs.runtime.machine import on_threads
 from xrgs.runtime.progress import progress
 from xrgs.training.dense.depths import (
     DepthMap,
@@ -149,16 +148,14 @@ def find_depths(
         Number of a view -> its depths. Views that can't be swept are missing.
     """
     planes = choose_planes(views, points)
-    # Views run in parallel, each on one thread, so that the bits do not depend on the thread count.
-    with torch_threads(1) as threads, ThreadPoolExecutor(threads) as pool:
-        swept = pool.map(lambda number: sweep(views, planes[number], number, backend), planes)
-        found = dict(zip(planes, progress(swept, "dense start", "view", len(planes)), strict=True))
-        for check in (consistent, not_seen_through):
-            passed = list(pool.map(partial(check, found), found))
-            found = {
-                number: replace(depths, good=good)
-                for (number, depths), good in zip(found.items(), passed, strict=True)
-            }
+    swept = on_threads(lambda number: sweep(views, planes[number], number, backend), planes)
+    found = dict(zip(planes, progress(swept, "dense start", "view", len(planes)), strict=True))
+    for check in (consistent, not_seen_through):
+        passed = list(on_threads(partial(check, found), found))
+        found = {
+            number: replace(depths, good=good)
+            for (number, depths), good in zip(found.items(), passed, strict=True)
+        }
     return found
 
 
