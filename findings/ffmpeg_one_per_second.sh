@@ -1,8 +1,10 @@
 #!/usr/bin/env bash
 # ffmpeg's picture n of one per second is not that of second n.
 # Version:   imageio-ffmpeg 0.8.1, whose wheel has ffmpeg 9.0.2
-# Source:    ffmpeg libavfilter/vf_fps.c: time stamps are rounded to the nearest second, and of the frames with one
-#            stamp the last is kept. `-r 1` drops and repeats frames in the muxing (fftools), by another rule.
+# Source:    ffmpeg libavfilter/vf_fps.c: time stamps are rounded to the nearest second by default, and a frame is
+#            dropped while the next one has a stamp that is not later: of the frames with one stamp the last is kept.
+#            `-r 1` drops and repeats frames right before the encoder, as the documentation says, by
+#            another rule: video_sync_process in fftools/ffmpeg_filter.c.
 # Behaviour: `-vf fps=1` gives the frame of n + 0.5 s. `-r 1` gives two neighbouring frames at the start, and
 #            later ones of n - 1.1 s. `fps=1:round=up` gives the frame of n s.
 # Guess:     (before the run) the frame that is nearest to n s.

@@ -1,9 +1,10 @@
 #!/usr/bin/env bash
 # ffmpeg's SSIM is not that of papers: it is some hundredths higher.
 # Version:   imageio-ffmpeg 0.8.1, whose wheel has ffmpeg 9.0.2; scikit-image 0.26.0
-# Source:    ffmpeg libavfilter/vf_ssim.c: means and variances are of blocks of 8x8 pixels, every 4 pixels, without
-#            weights. Its head says so; the documentation of the filter says only that SSIM is obtained. Wang et
-#            al., and what papers of radiance fields use, have a Gaussian window of 11x11 in each pixel.
+# Source:    ffmpeg libavfilter/vf_ssim.c: ssim_plane adds sums of 4x4 pixels to blocks of 8x8, every 4 pixels, without
+#            weights. Its head says that it approximates the original Gaussian weights so, for speed; the filter's
+#            documentation says that it obtains the SSIM of two videos. scikit-image documents the
+#            settings that match Wang et al.: Gaussian weights of 1.5 pixels, cut to 11x11, in each pixel.
 # Behaviour: the filter `ssim` gives higher values. The PSNR by the filter `psnr` is that of scikit-image.
 # Guess:     (before the run) within 0.002 of scikit-image's SSIM with the Gaussian window, per channel.
 # Matters:   renders that were scored by ffmpeg stand 0.02 to 0.04 better beside published numbers, more than most

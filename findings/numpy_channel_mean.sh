@@ -1,9 +1,10 @@
 #!/usr/bin/env bash
 # NumPy's mean per channel of a float32 photograph of 24 megapixels is 5 % too small.
 # Version:   numpy 2.4.6
-# Source:    numpy documentation of sum, Notes: sums are pairwise only along the fast axis in memory. The mean over
-#            the axes (0, 1) of [rows, columns, channels] goes along the slow ones:
-#            each channel has one running sum in float32.
+# Source:    numpy documentation of sum, Notes: with an axis, the precise (partly pairwise) sum is made only along the
+#            fast axis in memory; else each number is added to the result. That of mean, Notes: the mean has
+#            the precision of its input. The axes (0, 1) of [rows, columns, channels] are the slow
+#            ones: each channel has one running sum in float32.
 # Behaviour: the sum becomes so large that each addend is rounded away in part. The mean over
 #            all axes of the same array is right to 1e-7, and so is mean(axis=0) followed by mean(axis=0).
 # Guess:     (before the run) right to 0.01 %, as the mean over all axes is.
