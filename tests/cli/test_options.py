@@ -120,6 +120,7 @@ def test_a_value_behind_an_option_may_have_an_equals_sign(
         ("report --store=", "--store: is empty; give a path"),
         ("train garden --store=", "--store: is empty; give a path"),
         ("data inspect garden --store=", "is empty; give a path"),
+        ("bench --load=", "is empty; give a path"),
     ],
 )
 def test_wrong_usage_is_named_and_ends_with_2(
