@@ -17,7 +17,14 @@ from pathlib import Path
 from typing import Annotated, Any, TypeAlias, get_type_hints
 
 import tyro
-from tyro.conf import CascadeSubcommandArgs, DisallowNone, FlagCreatePairsOff, OmitArgPrefixes, arg
+from tyro.conf import (
+    CascadeSubcommandArgs,
+    DisallowNone,
+    FlagCreatePairsOff,
+    OmitArgPrefixes,
+    Positional,
+    arg,
+)
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 import xrgs
@@ -66,6 +73,45 @@ def _path(kind: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Path] | None:
     )
 
 
+@_REGISTRY.primitive_rule
+def _texts(kind: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[tuple[str, ...]] | None:
+    """Read the values of an option that takes any number of texts; none would mean all."""
+    if kind.type != tuple[str, ...]:
+        return None
+    least = 0 if Positional in kind.markers else 1  # commands say themselves what they lack
+    return PrimitiveConstructorSpec(
+        nargs="*",
+        metavar="TEXT ...",
+        instance_from_str=lambda words: _given_texts(words, least),
+        is_instance=lambda value: isinstance(value, tuple),
+        str_from_instance=list,
+    )
+
+
+@_REGISTRY.primitive_rule
+def _text(kind: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[str] | None:
+    """Read a text that is not empty."""
+    if kind.type is not str:
+        return None
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="TEXT",
+        instance_from_str=lambda words: _given_texts(words)[0],
+        is_instance=lambda value: isinstance(value, str),
+        str_from_instance=lambda text: [text],
+    )
+
+
+def _given_texts(words: Sequence[str], least: int = 1) -> tuple[str, ...]:
+    """Return the values of an option; ValueError for fewer than `least`, or an empty one.
+
+    A variable that is not set gives either: `xrgs-store trim --sweep $ID` would trim all cells.
+    """
+    if len(words) < least or "" in words:
+        raise ValueError("takes a value, and none or an empty one is given")
+    return tuple(words)
+
+
 def _given_path(text: str) -> Path:
     """Return the path of an option; ValueError for an empty one, as of an unset variable."""
     if not text:
@@ -100,7 +146,7 @@ def run(
     functions = {command: target} if callable(target) else target
     names = frozenset(name for function in functions.values() for name in _names(function))
     name = "[a-z][a-z_]*"
-    if overrides in {command, *sys.argv[1:2]}:
+    if overrides and overrides in {command, *sys.argv[1:2]}:
         name = "|".join({*_names(functions[overrides])} - {*known_keys()})
     assignment = re.compile(f"({name})=(.*)", re.DOTALL)
     words = _with_options(sys.argv[1:], assignment, names)
