@@ -69,8 +69,15 @@ class CellRow:
 
     @property
     def name(self) -> str:
-        """The cell's name for people."""
-        return f"{self.id}  {self.scene} / {self.arm}"
+        """The cell's id, and its name for people: scene, label and condition, and replicate."""
+        draw = self.recorded.variant_seed if self.recorded else 0
+        parts = (
+            self.scene,
+            self.arm,
+            f"variant.seed {draw}" if draw else "",
+            "" if self.seed is None else f"seed {self.seed}",
+        )
+        return f"{self.id}  {' / '.join(filter(None, parts))}"
 
     @property
     def seed(self) -> int | None:

@@ -260,7 +260,7 @@ def show(store: Store, cell: CellRow) -> str:
 
 def _head(cell: CellRow) -> Iterator[str]:
     reason = f": {cell.state.reason.partition(chr(10))[0]}" if cell.state.reason else ""
-    yield f"cell {cell.name} / seed {cell.seed}"
+    yield f"cell {cell.name}"
     yield f"  {cell.state.name}{reason}, {format_age(cell.age_s)} ago, {format_size(cell.bytes)}"
     yield f"  variant {cell.variant_id}"
     yield f"  sweeps {', '.join(reversed(cell.sweeps)) or 'none'}"
