@@ -14,7 +14,7 @@ from tyro.extras import literal_type_from_choices
 from xrgs import config
 from xrgs.cli import options
 from xrgs.cli.options import STORE, Folder, Names, OptionalFolder, shown_as
-from xrgs.errors import XrgsError
+from xrgs.errors import StoreError, XrgsError
 from xrgs.mixture.paths import is_failed
 from xrgs.mixture.saved_variant import MANIFEST
 from xrgs.photos.images import SUFFIXES
@@ -161,7 +161,13 @@ def export(
     is_other_path = path.name != name and not path.is_dir()
     if path.suffix.lower()[1:] not in SPLAT_FORMATS and not is_other_path:
         home = Store(store)
-        path = path if path.is_dir() and not home.exists else home.find_folder(name)
+        try:
+            path = path if path.is_dir() and not home.exists else home.find_folder(name)
+        except StoreError:
+            from xrgs.formats.saved import check_is_read
+
+            check_is_read(path)
+            raise
     say(write_export(path, out, layout))
 
 
