@@ -203,12 +203,14 @@ def _place(words: _Words) -> _Placed | None:
     from xrgs.store.trimming import home_of
     from xrgs.sweep import build_variants
     from xrgs.sweep.estimate import read_views
+    from xrgs.sweep.plan import check_plugins
 
     conf = words.compose()
     store, name = Store(conf.store), scenes.label(conf.scene)
     photographs = scenes.names(conf.scene, conf.variant.long_side)
     kind = _kind(conf)
     _say(f"{name}: {counted(len(photographs), kind)} found")
+    check_plugins([conf], imported=conf.dry_run)
     if conf.dry_run:
         store.check_room()
     else:
