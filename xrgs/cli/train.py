@@ -10,6 +10,7 @@ from __future__ import annotations
 import shlex
 import time
 from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -113,7 +114,7 @@ class _Words:
         return next((value for name, _, value in values if name == key), "")
 
     def compose(self) -> Conf:
-        """Return the config, composed once for equal words.
+        """Return a config of its own, composed once for equal words.
 
         Raises:
             XrgsError: A word is wrong, or gives several values.
@@ -124,7 +125,7 @@ class _Words:
                 words = with_quotes(key)
                 check_no_axis(words)
                 self.confs[key] = composing.compose(*words)
-        return self.confs[key]
+        return deepcopy(self.confs[key])
 
 
 def train(settings: Settings) -> None:
