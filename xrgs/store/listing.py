@@ -89,22 +89,33 @@ class CellRow:
         """The id of the cell's variant; None where the identity can't be read."""
         return self.identity.variant if self.identity else None
 
-    @cached_property
+    @property
     def stale(self) -> tuple[str, ...]:
         """Parts of the program, and the arithmetic, that differ from the cell's identity.
 
-        A sweep trains a stale cell again, under another id.
+        A sweep trains a stale cell again, under another id. For a cell `of_elsewhere` it is the
+        reason.
         """
+        return self._compared[0]
+
+    @property
+    def of_elsewhere(self) -> bool:
+        """Whether its backend or a component is not installed here, as for reading a store."""
+        return self._compared[1]
+
+    @cached_property
+    def _compared(self) -> tuple[tuple[str, ...], bool]:
+        """`stale` and `of_elsewhere`."""
         if self.identity is None:
-            return ()
+            return (), False
         try:
             changed = changed_code(self.identity, cached=True)
             here = arithmetic(str(self.identity.splat["backend"]))
-        except XrgsError as error:  # the backend is not on this machine, which only reads stores
-            return (str(error),)
+        except XrgsError as error:
+            return (str(error),), True
         if self.identity.arithmetic != here:
             changed.append(f"arithmetic ({self.identity.arithmetic}, here {here})")
-        return tuple(changed)
+        return tuple(changed), False
 
     @cached_property
     def age_s(self) -> float | None:
