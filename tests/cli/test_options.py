@@ -148,6 +148,10 @@ def test_wrong_usage_is_named_and_ends_with_2(
         ("view gone.ply", "gone.ply: cannot be read"),
         ("train . store=", "store=: is empty; give a path"),
         ("data inspect . store=", "store=: is empty; give a path"),
+        # Overrides before and behind options
+        ("train gone seed=1 --size 250 +ablation=plus", "gone: there is no such folder"),
+        ("train seed=1 --dry-run gone", "gone: there is no such folder"),
+        ("data inspect gone --store s seed=1 --out a=b.txt", "--out a=b.txt: the sheet is a PNG"),
     ],
 )
 def test_an_error_is_a_message_and_ends_with_1(

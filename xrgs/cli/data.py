@@ -87,7 +87,8 @@ def lpips(
 
 
 def inspect(
-    variant: Positional[Annotated[tuple[str, ...], shown_as("FOLDER|CELL|KEY=VALUE ...")]],
+    variant: Positional[Annotated[str, arg(metavar="FOLDER|CELL|KEY=VALUE")]],
+    overrides: Positional[Annotated[tuple[str, ...], shown_as("KEY=VALUE ...")]] = (),
     out: Annotated[Path | None, shown_as("FILE.png")] = None,
     store: OptionalFolder = None,
 ) -> None:
@@ -97,17 +98,16 @@ def inspect(
         variant: A folder of photographs, which are not degraded; overrides may follow. Or overrides
             as for xrgs-sweep, such as scene=llff/fern variant.factor=4. In both cases a variant
             that the store lacks is built. Or a variant by its folder or id, or a cell of it.
+        overrides: Keys of xrgs-sweep.
         out: The file of the sheet; by default it is named after the variant.
         store: The store, as store=FOLDER.
     """
     from xrgs.store.inspect import describe
 
-    if not variant:
-        raise XrgsError("inspect: give a folder of photographs, or scene=NAME and other keys")
     if out is not None and out.suffix.lower() != ".png":  # before the cameras are looked for
         raise XrgsError(f"out={out}: the sheet is a PNG; name a file FILE.png")
-    words = (*variant, f"store={store}") if store else variant
-    say(describe(_variant(words), out))
+    stores = (f"store={store}",) if store else ()
+    say(describe(_variant((variant, *overrides, *stores)), out))
 
 
 def _variant(words: Sequence[str]) -> Path:

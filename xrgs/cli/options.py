@@ -13,6 +13,7 @@ import sys
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import is_dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias, get_type_hints
 
@@ -146,10 +147,13 @@ def run(
     functions = {command: target} if callable(target) else target
     names = frozenset(name for function in functions.values() for name in _names(function))
     name = "[a-z][a-z_]*"
-    if overrides and overrides in {command, *sys.argv[1:2]}:
+    takes_overrides = overrides in {command, *sys.argv[1:2]} - {""}
+    if takes_overrides:
         name = "|".join({*_names(functions[overrides])} - {*known_keys()})
     assignment = re.compile(f"({name})=(.*)", re.DOTALL)
     words = _with_options(sys.argv[1:], assignment, names)
+    if takes_overrides:
+        words = _with_overrides_last(words)
     with errors_as_messages(command, assignment):
         if callable(target):
             tyro.cli(
@@ -201,6 +205,20 @@ def _with_options(
             is_file = os.access(user_path(value), os.F_OK)
             options += [option, *([value] if is_file else value.split(","))]
     return others + options
+
+
+def _with_overrides_last(words: Sequence[str]) -> list[str]:
+    """Move Hydra's overrides behind all options; tyro reads only words that stand together.
+
+    A word `A=B` behind an option may be its value, unless `A` is a key of the config.
+    """
+    others, moved = list[str](), list[str]()
+    for before, word in pairwise(["", *words]):
+        key, is_assignment, _ = word.partition("=")
+        is_key = is_assignment and (key[:1] in {"+", "~"} or key in known_keys())
+        free = is_assignment and key[:1] != "-" and before[:2] != "--"
+        (moved if is_key or free else others).append(word)
+    return others + moved
 
 
 def _option(name: str) -> str:
