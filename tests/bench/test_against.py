@@ -66,7 +66,7 @@ def test_both_processes_are_started_anew_after_a_few_repetitions(
             return {"ms": self.ms}
 
     monkeypatch.setattr(against, "_Worker", Worker)
-    found = against.measure(sys.executable, load, (load, load), [1], 11)
+    found = against.measure(Path(sys.executable), load, (load, load), [1], 11)
     assert started == ["this", "other", "other", "this", "this", "other"]
     row = found["rows"][0]
     assert (row["times_faster_low"], row["times_faster"]) == (0.5, 1.0)
