@@ -60,8 +60,10 @@ def read(store: str) -> pd.DataFrame:
     """Return the newest done cell of each recipe and backend, indexed by (label, backend)."""
     home = xrgs.Store(store)
     cells = home.cells().query("state == 'done'")
-    cells["backend"] = [home.cell(cell_id).config().splat.backend for cell_id in cells["cell_id"]]
-    newest = cells.groupby(["label", "backend"]).tail(1)
+    folders = [home.cell(cell_id) for cell_id in cells["cell_id"]]
+    cells["backend"] = [folder.config().splat.backend for folder in folders]
+    cells["ended"] = [folder.status_file.stat().st_mtime for folder in folders]
+    newest = cells.sort_values("ended").groupby(["label", "backend"]).tail(1)
     return newest.set_index(["label", "backend"]).sort_index()[list(COLUMNS)]
 
 

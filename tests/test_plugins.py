@@ -18,6 +18,7 @@ from xrgs.errors import XrgsError
 from xrgs.safeio import code
 from xrgs.store import identity
 from xrgs.store.identity import cell_id, cell_identity, changed_code
+from xrgs.sweep.plan import check_plugins
 from xrgs.training import components
 from xrgs.training.components import Components
 from xrgs.training.dataset import Dataset
@@ -255,3 +256,20 @@ def test_settings_come_from_the_command_line() -> None:
     assert from_dict(asdict(conf)) == conf
     with pytest.raises(XrgsError, match=r"^components\.plugins\.one=0\.5: must be a mapping"):
         compose("+components.plugins.one=0.5")
+
+
+def test_a_plan_imports_a_plugin_only_for_a_dry_run(install: Install, baseline: Conf) -> None:
+    install("dist", {"one": "planned:Plugin", "none": "planned:Settings"}, {"planned.py": SOURCE})
+    baseline.components.plugins = {"one": {"wieght": 1.0}}
+    check_plugins([baseline], imported=False)
+    assert "planned" not in sys.modules
+    with pytest.raises(XrgsError, match=r"^components\.plugins\.one\.wieght: there is no "):
+        check_plugins([baseline], imported=True)
+    baseline.components.plugins = {"one": {"weight": 1.0}}
+    check_plugins([baseline], imported=True)
+    baseline.components.plugins = {"none": {}}
+    with pytest.raises(XrgsError, match=r"none: its entry point planned:Settings must name a sub"):
+        check_plugins([baseline], imported=True)
+    baseline.components.plugins = {"gone": {}}
+    with pytest.raises(XrgsError, match=r"gone: no installed package offers a component"):
+        check_plugins([baseline], imported=False)

@@ -36,6 +36,8 @@ _AT = re.compile(r" - at `\$\.?(.*)`$")
 #: Placeholder in `conf/config.yaml` for a value that the files of `conf/scene/` set.
 _OPEN = "???"
 _HYDRA_LOCK = threading.Lock()
+#: torch holds whole numbers below it, and from its negative on.
+INT64_LIMIT = 2**63
 
 
 def compose(*overrides: str) -> Conf:
@@ -103,8 +105,8 @@ def to_conf(cfg: DictConfig) -> Conf:
 
     values = {name: plain(name) for name in map(str, cfg) if name != "hydra"}
     for key, value in dotted(values):
-        if isinstance(value, int) and not -(2**63) <= value < 2**63:  # torch can't hold it
-            raise XrgsError(f"{key}={value}: must be below 2^63 = {2**63}")
+        if isinstance(value, int) and not -INT64_LIMIT <= value < INT64_LIMIT:
+            raise XrgsError(f"{key}={value}: must be below 2^63 = {INT64_LIMIT}")
     conf = from_dict(values)
     for key in PATHS:
         *groups, name = key.split(".")

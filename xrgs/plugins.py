@@ -2,10 +2,10 @@
 
 A package provides a component by an entry point in the group `xrgs.components`; the name of the
 entry point is the key under `components.plugins` of the config. Finding a plugin and hashing its
-source for identities executes none of its code. Only `load` imports it, and training calls `load`
-only for the plugins in the cell's config. That config comes from the user's command line and files;
-a config from a store is trained again only if the user names its plugins (`xrgs.sweep.rerun`). So a
-store from another person never makes xrgs import a package.
+source for identities executes none of its code. Only `load` imports it, and trainings and dry runs
+call `load` only for the plugins in a cell's config. That config comes from the user's command line
+and files; a config from a store is trained again only if the user names its plugins
+(`xrgs.sweep.rerun`). So a store from another person never makes xrgs import a package.
 
 This module does not import torch, so that planning and reporting stay quick.
 """
@@ -106,6 +106,22 @@ def load(name: str) -> object:
             f"components.plugins.{name}: importing {point.value} failed:"
             f" {type(error).__name__}: {error}"
         ) from error
+
+
+def check(name: str, values: Mapping[str, Any]) -> None:
+    """Import a plugin and check its settings, before a training does.
+
+    Raises:
+        XrgsError: As `load` and `parse_settings`, or the plugin has no settings.
+    """
+    key = f"components.plugins.{name}"
+    kind = getattr(load(name), "settings_type", None)
+    if kind is None:
+        raise XrgsError(
+            f"{key}: its entry point {find(name).value} must name a subclass of"
+            " xrgs.training.components.Component that defines settings_type"
+        )
+    parse_settings(kind, values, key)
 
 
 def parse_settings(kind: type[_Settings], values: Mapping[str, Any], key: str) -> _Settings:

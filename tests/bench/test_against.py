@@ -66,7 +66,7 @@ def test_both_processes_are_started_anew_after_a_few_repetitions(
             return {"ms": self.ms}
 
     monkeypatch.setattr(against, "_Worker", Worker)
-    found = against.measure(sys.executable, load, (load, load), [1], 11)
+    found = against.measure(Path(sys.executable), load, (load, load), [1], 11)
     assert started == ["this", "other", "other", "this", "this", "other"]
     row = found["rows"][0]
     assert (row["times_faster_low"], row["times_faster"]) == (0.5, 1.0)
@@ -76,7 +76,8 @@ def test_both_processes_are_started_anew_after_a_few_repetitions(
 def test_an_installation_is_compared_with_itself(tmp_path: Path) -> None:
     if resolve_backend("auto") != "native":
         pytest.skip("the native backend was not built")
-    settings = Settings(smoke=True, repeats=2, threads=2, out=str(tmp_path), against=sys.executable)
+    python = Path(sys.executable)
+    settings = Settings(smoke=True, repeats=2, threads=2, out=tmp_path, against=python)
     text = run.run(settings)
     with (tmp_path / "against.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
@@ -99,12 +100,12 @@ def test_an_installation_that_cannot_run_is_named_with_its_reason(
     python.write_text("#!/bin/sh\necho 'no torch here' >&2\nexit 3\n")
     python.chmod(0o755)
     with pytest.raises(XrgsError, match=r"python cannot run the benchmark: no torch here"):
-        against.measure(str(python), load, (load, load), [1], 1)
+        against.measure(python, load, (load, load), [1], 1)
     python.write_text("#!/bin/sh\necho hello\nexec cat >/dev/null\n")
     with pytest.raises(XrgsError, match=r"answers 'hello', not JSON"):
-        against.measure(str(python), load, (load, load), [1], 1)
+        against.measure(python, load, (load, load), [1], 1)
     python.write_bytes(b"\0")
     with pytest.raises(XrgsError, match=r"cannot be run: Exec format error"):
-        against.measure(str(python), load, (load, load), [1], 1)
+        against.measure(python, load, (load, load), [1], 1)
     with pytest.raises(XrgsError, match="must be the Python executable"):
-        against.measure(str(tmp_path), load, (load, load), [1], 1)
+        against.measure(tmp_path, load, (load, load), [1], 1)

@@ -245,6 +245,7 @@ def test_what_cant_be_exported_is_named(xrgs_data: XrgsData, tmp_path: Path) -> 
         (["gone"], "--store xrgs-store is not a store"),
         (["gone", "--store", "s"], "gone: no cells or variants have such an id"),
         (["c", "--store", "s"], "c: several cells or variants have such an id or scene: c1-ab, cd"),
+        (["a.splat", "--store", "s"], "npx @playcanvas/splat-transform a.splat a.ply"),
         (["./gone"], "gone: No such file or directory; give the folder"),
         (["empty"], "empty: neither a cell nor a variant"),
     ):

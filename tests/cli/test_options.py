@@ -120,6 +120,11 @@ def test_a_value_behind_an_option_may_have_an_equals_sign(
         ("report --store=", "--store: is empty; give a path"),
         ("train garden --store=", "--store: is empty; give a path"),
         ("data inspect garden --store=", "is empty; give a path"),
+        ("bench --load=", "is empty; give a path"),
+        # As of a variable that is not set: none would mean all, and an empty id begins every id.
+        ("store trim --yes --sweep", "--sweep: takes a value, and none or an empty one is given"),
+        ("store rm --yes --scenes=", "--scenes: takes a value, and none or an empty one is given"),
+        ("report --against=", "--against: takes a value, and none or an empty one is given"),
     ],
 )
 def test_wrong_usage_is_named_and_ends_with_2(
@@ -143,6 +148,10 @@ def test_wrong_usage_is_named_and_ends_with_2(
         ("view gone.ply", "gone.ply: cannot be read"),
         ("train . store=", "store=: is empty; give a path"),
         ("data inspect . store=", "store=: is empty; give a path"),
+        # Overrides before and behind options
+        ("train gone seed=1 --size 250 +ablation=plus", "gone: there is no such folder"),
+        ("train seed=1 --dry-run gone", "gone: there is no such folder"),
+        ("data inspect gone --store s seed=1 --out a=b.txt", "--out a=b.txt: the sheet is a PNG"),
     ],
 )
 def test_an_error_is_a_message_and_ends_with_1(
@@ -188,3 +197,10 @@ def test_the_home_folder_of_every_option_is_expanded(
     _, out, err = call_command(*words.split())
     assert "/nowhere/s" in out + err
     assert "~" not in out + err
+
+
+@pytest.mark.parametrize("command", ["view", "store rm --yes", "data export"])
+def test_an_empty_cell_is_no_beginning_of_an_id(call_command: RunCommand, command: str) -> None:
+    code, out, err = call_command(*command.split(), "")
+    assert (code, out) == (2, "")
+    assert "takes a value, and none or an empty one is given" in " ".join(err.split())

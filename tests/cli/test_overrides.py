@@ -449,3 +449,12 @@ def test_no_message_has_the_words_of_a_parser(word: str, said: str) -> None:
 )
 def test_a_whole_number_may_be_written_in_any_way(word: str, read: str) -> None:
     assert with_quotes([word]) == [read]
+
+
+def test_a_setting_of_a_plugin_without_a_plus_is_told_it(
+    compose: Callable[..., config.Conf],
+) -> None:
+    word = "components.plugins.fade.weight=0.1"
+    said = re.escape("has a + before it: +components.plugins.fade")
+    with pytest.raises(XrgsError, match=said), explained():
+        compose(word)

@@ -45,7 +45,8 @@ def test_a_report_has_the_pictures_the_base_and_the_outcomes_that_are_named(
     for words, message in (
         ("--pictures gone", "there is no picture of that name; choose from: motorcycle--consist"),
         ("--against gone", "the sweep has no such label; choose from: baseline, consistency"),
-        ("--outcomes nice", "there is no such metric; choose from: "),
+        ("--outcomes lpips_vgg", "these cells have no such metric; choose from: training_time_s"),
+        ("--outcomes nice", "these cells have no such metric; choose from: "),
     ):
         code, _, err = call_command(*arguments, *words.split())
         assert code == 1

@@ -104,7 +104,7 @@ def test_nothing_is_removed_without_a_yes(
     code, out, _ = xrgs_store("rm", "abd", "--dry-run")
     assert code == 0
     assert "to remove: cells (1): " in out
-    assert "abd  fern / mip, done" in out
+    assert "abd  fern / mip / seed 0, done" in out
     monkeypatch.setattr(sys, "stdin", io.StringIO("y\n"))  # no terminal: nobody has answered
     code, _, err = xrgs_store("rm", "abd")
     assert code == 1
@@ -191,3 +191,32 @@ def test_a_score_on_request_says_what_it_lacks(call_command: Call, store: Path) 
     code, _, err = call_command("store", "rescore", "--store", str(store), "--also", "nice")
     assert code == 1
     assert "--also nice: choose from: lpips_vgg" in err
+
+
+@pytest.mark.parametrize("amount", ["--older-days=-7", "--larger-mb=-1", "--larger-mb=nan"])
+def test_an_amount_below_0_chooses_no_cell(xrgs_store: Call, tmp_path: Path, amount: str) -> None:
+    """In `find -mtime -7` it means younger than 7 days; here it was true of every cell."""
+    code, out, err = xrgs_store("rm", "--yes", amount)
+    assert (code, out) == (1, "")
+    assert f"{amount.partition('=')[0]} " in err
+    assert "must be finite and at least 0" in err
+    assert cells(tmp_path) == ["abc", "abd"]
+
+
+def test_an_archive_without_a_cell_is_not_written(
+    xrgs_store: Call, tmp_path: Path, begun: Callable[[str, int], CellFolder]
+) -> None:
+    begun("abe", 5)
+    code, out, err = xrgs_store("pack", "abe", "--out", "study.tar.xz")
+    assert (code, out) == (1, "")
+    assert "pack: none of the chosen cells is done" in err
+    assert not (tmp_path / "study.tar.xz").exists()
+
+
+def test_replicates_of_a_cell_have_different_names(xrgs_store: Call, tmp_path: Path) -> None:
+    store = Store(tmp_path / "s")
+    rows = [RecordedCell(n, "mip", "", "fern", d, 0, "v", "a") for n, d in (("abc", 0), ("abd", 2))]
+    store.write_sweep([], rows)
+    _, out, _ = xrgs_store("trim", "--dry-run")
+    assert "  abc  fern / mip / seed 0  " in out
+    assert "  abd  fern / mip / variant.seed 2 / seed 0  " in out

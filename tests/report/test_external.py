@@ -232,3 +232,9 @@ def test_folders_have_labels_or_their_own_names() -> None:
     for wrong in ("gsplat:", "a:x b/a"):
         with pytest.raises(ReportError, match="external="):
             parse(wrong.split())
+
+
+def test_renders_beside_no_done_cell_are_refused(made: MakeStore, tmp_path: Path) -> None:
+    made.add_error("fern")
+    with pytest.raises(ReportError, match="external=gsplat: no cell of the sweep is done"):
+        with_external(made.read(), ReportStore(made.store.path), [External("gsplat", tmp_path)])

@@ -124,7 +124,8 @@ def test_a_cell_that_is_trained_is_never_touched(store: Store) -> None:
     held = lease.acquire(store.leases, "half1")  # begun by another sweep after the plan
     assert held is not None
     _, left = carry_out(store, plan)
-    assert left == ["half1  motorcycle / ?, unfinished: it is left: a sweep is training it"]
+    name = "half1  motorcycle / ? / seed 0"
+    assert left == [f"{name}, unfinished: it is left: a sweep is training it"]
     assert store.cell("half1").state().name == "unfinished"
     assert not store.cell("done1").path.exists()
     plan = plan_removal(store, store.cell_rows())
@@ -167,3 +168,10 @@ def test_trimmed_cells_stay_done_and_variants_in_use_are_left(store: Store) -> N
     assert (store.variants / "aa-used/images/a.png").exists()
     cells = store.cell_rows()
     assert plan_trim(store, cells, cells, variants=True).items == ()
+
+
+def test_gc_leaves_cells_whose_program_is_elsewhere(store: Store, cells: Any) -> None:
+    add_done(cells, "plugin1", variant="aa-used", components={"plugins": {"gone": {}}})
+    plan = gc(store, "old_code")
+    assert [item.lease for item in plan.items] == ["old1"]
+    assert "left alone, of a backend or component not installed here: 1" in plan.notes

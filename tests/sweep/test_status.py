@@ -59,9 +59,9 @@ def test_every_cell_is_counted_and_told_why(store: Store) -> None:
     assert "3 done, 1 running, 1 unfinished, 1 failed, 1 corrupt" in text
     assert "1 folder of earlier attempts" in text
     assert "1 variant, 1 sweep" in text
-    assert "failed  motorcycle / ?  ended by SIGKILL\n" in text
+    assert "failed  motorcycle / ? / seed 0  ended by SIGKILL\n" in text
     (sweep_id,) = store.sweep_ids()
-    assert f"busy  statue / mip  sweep {sweep_id}  by process {os.getpid()} on" in text
+    assert f"busy  statue / mip / seed 0  sweep {sweep_id}  by process {os.getpid()} on" in text
     assert ": training 20 of 80 steps, 3 steps/s, ~20 s left" in text
     assert "scores.csv is missing or has another size" in text
     lines = [line.split() for line in text.splitlines()]
@@ -69,7 +69,9 @@ def test_every_cell_is_counted_and_told_why(store: Store) -> None:
     assert ["statue", "consistency", "1", "1"] in lines
     done = text.partition("done, the latest first:\n")[2].partition("\n\n")[0]
     assert {line.strip() for line in done.splitlines()} == {
-        *("good  statue / baseline", "stale  statue / consistency", "twice  motorcycle / ?")
+        "good  statue / baseline / seed 0",
+        "stale  statue / consistency / seed 0",
+        "twice  motorcycle / ? / seed 0",
     }
     stale = {cell.id: cell.stale for cell in store.cell_rows() if cell.stale}
     assert stale == {"stale": ("core", "gone")}

@@ -43,7 +43,7 @@ _PAIR_REPEATS = 5
 
 
 def measure(
-    python: str, scene: Load, step: tuple[Load, Load], counts: Sequence[int], repeats: int
+    python: Path, scene: Load, step: tuple[Load, Load], counts: Sequence[int], repeats: int
 ) -> dict[str, Any]:
     """Time rendering and training steps in both installations, in turn.
 
@@ -63,8 +63,8 @@ def measure(
     """
     # Not resolved: the Python of a virtual environment is a link, and finds the environment by its
     # own path.
-    other = str(Path(python).absolute())
-    if not (Path(other).is_file() and os.access(other, os.X_OK)):
+    other = python.absolute()
+    if not (other.is_file() and os.access(other, os.X_OK)):
         raise XrgsError(f"--against {python}: must be the Python executable of an environment")
     with tempfile.TemporaryDirectory(prefix="xrgs-bench-") as name:
         folder = Path(name)
@@ -73,7 +73,7 @@ def measure(
             files[task] = str(folder / f"{task}.npz")
             loads.write(Path(files[task]), load)
         setup = {"scene": files[RENDER], "views": {key: files[key] for key in (HR_STEP, LR_STEP)}}
-        executables = dict(zip(SIDES, (sys.executable, other), strict=True))
+        executables = dict(zip(SIDES, (sys.executable, str(other)), strict=True))
         cases = [(task, count) for task in files for count in counts]
         durations: dict[tuple[str, str, int], list[float]] = {
             (side, *case): [] for side in SIDES for case in cases

@@ -13,14 +13,15 @@ from xrgs.errors import XrgsError
 from xrgs.runtime.machine import usable_cores
 from xrgs.runtime.progress import progress
 from xrgs.safeio.atomic import atomic_writer, write_json
-from xrgs.safeio.paths import user_path
 from xrgs.safeio.records import table_text
 from xrgs.safeio.sanitize import for_csv
 from xrgs.splat.backend import resolve_backend
+from xrgs.splat.settings import outside_limits
 from xrgs.store import provenance
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
+    from pathlib import Path
 
     from xrgs.bench.loads import Load
     from xrgs.bench.settings import Settings
@@ -59,8 +60,6 @@ SMOKE = BenchmarkSizes(
 #: trained scene of llff/fern with the same numbers of Gaussians and pixels.
 SCENE_SIZE_PER_SPACING = 1.88
 _LR_FACTOR = 5
-#: torch's generator takes seeds below this one.
-_SEEDS = 2**63
 
 
 def run(settings: Settings) -> str:
@@ -72,18 +71,13 @@ def run(settings: Settings) -> str:
     Raises:
         XrgsError: An argument is wrong, or a file cannot be read or written.
     """
-    for name, value in vars(settings).items():
-        if value == "":  # as of an unset variable, which would mean the current folder
-            raise XrgsError(f"--{name}: is empty; give a path, or leave the option out")
+    for message in outside_limits(settings):
+        raise XrgsError(message)
     if settings.save is not None:
         return _save(settings.save, settings)
-    if settings.repeats < 1 or settings.threads < 0:
-        raise XrgsError("repeats must be at least 1 and threads at least 0")
-    if not 0 <= settings.seed < _SEEDS:
-        raise XrgsError(f"seed={settings.seed}: must be 0 to 2^63 - 1")
     counts = sorted({1, settings.threads or usable_cores()})
     sizes = SMOKE if settings.smoke else FULL
-    load = None if settings.load is None else loads.read(user_path(settings.load))
+    load = None if settings.load is None else loads.read(settings.load)
     _check_writable(settings)  # before minutes of measurements
     if settings.against is not None:
         return _compare(settings.against, load, sizes, counts, settings)
@@ -97,16 +91,16 @@ def run(settings: Settings) -> str:
     return tables.text(results)
 
 
-def _save(file: str, settings: Settings) -> str:
+def _save(file: Path, settings: Settings) -> str:
     if settings.cell is None or settings.view is None:
         raise XrgsError("--save FILE.npz needs --cell FOLDER and --view NAME")
-    load = loads.load_from_cell(user_path(settings.cell), settings.view)
-    loads.write(user_path(file), load)
+    load = loads.load_from_cell(settings.cell, settings.view)
+    loads.write(file, load)
     return f"{file}: {tables.describe(load.sizes)}"
 
 
 def _compare(
-    python: str,
+    python: Path,
     load: Load | None,
     sizes: BenchmarkSizes,
     counts: Sequence[int],
@@ -168,8 +162,7 @@ def _csv(rows: Sequence[Row]) -> bytes:
 
 def _check_writable(settings: Settings) -> None:
     """Make the folders of the results, and check that files can be written there."""
-    files = [user_path(settings.out) / "bench.csv"]
-    files += [user_path(settings.json)] if settings.json is not None else []
+    files = [settings.out / "bench.csv", *filter(None, [settings.json])]
     with _writing():
         for file in files:
             file.parent.mkdir(parents=True, exist_ok=True)
@@ -181,13 +174,12 @@ def _check_writable(settings: Settings) -> None:
 
 
 def _write(files: Mapping[str, bytes], results: dict[str, Any], settings: Settings) -> None:
-    folder = user_path(settings.out)
     with _writing():
         for name, content in files.items():
-            with atomic_writer(folder / name) as stream:
+            with atomic_writer(settings.out / name) as stream:
                 stream.write(content)
         if settings.json is not None:
-            write_json(user_path(settings.json), results)
+            write_json(settings.json, results)
 
 
 @contextmanager

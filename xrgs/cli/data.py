@@ -14,7 +14,7 @@ from tyro.extras import literal_type_from_choices
 from xrgs import config
 from xrgs.cli import options
 from xrgs.cli.options import STORE, Folder, Names, OptionalFolder, shown_as
-from xrgs.errors import XrgsError
+from xrgs.errors import StoreError, XrgsError
 from xrgs.mixture.paths import is_failed
 from xrgs.mixture.saved_variant import MANIFEST
 from xrgs.photos.images import SUFFIXES
@@ -87,7 +87,8 @@ def lpips(
 
 
 def inspect(
-    variant: Positional[Annotated[tuple[str, ...], shown_as("FOLDER|CELL|KEY=VALUE ...")]],
+    variant: Positional[Annotated[str, arg(metavar="FOLDER|CELL|KEY=VALUE")]],
+    overrides: Positional[Annotated[tuple[str, ...], shown_as("KEY=VALUE ...")]] = (),
     out: Annotated[Path | None, shown_as("FILE.png")] = None,
     store: OptionalFolder = None,
 ) -> None:
@@ -97,17 +98,16 @@ def inspect(
         variant: A folder of photographs, which are not degraded; overrides may follow. Or overrides
             as for xrgs-sweep, such as scene=llff/fern variant.factor=4. In both cases a variant
             that the store lacks is built. Or a variant by its folder or id, or a cell of it.
+        overrides: Keys of xrgs-sweep.
         out: The file of the sheet; by default it is named after the variant.
         store: The store, as store=FOLDER.
     """
     from xrgs.store.inspect import describe
 
-    if not variant:
-        raise XrgsError("inspect: give a folder of photographs, or scene=NAME and other keys")
     if out is not None and out.suffix.lower() != ".png":  # before the cameras are looked for
         raise XrgsError(f"out={out}: the sheet is a PNG; name a file FILE.png")
-    words = (*variant, f"store={store}") if store else variant
-    say(describe(_variant(words), out))
+    stores = (f"store={store}",) if store else ()
+    say(describe(_variant((variant, *overrides, *stores)), out))
 
 
 def _variant(words: Sequence[str]) -> Path:
@@ -161,7 +161,13 @@ def export(
     is_other_path = path.name != name and not path.is_dir()
     if path.suffix.lower()[1:] not in SPLAT_FORMATS and not is_other_path:
         home = Store(store)
-        path = path if path.is_dir() and not home.exists else home.find_folder(name)
+        try:
+            path = path if path.is_dir() and not home.exists else home.find_folder(name)
+        except StoreError:
+            from xrgs.formats.saved import check_is_read
+
+            check_is_read(path)
+            raise
     say(write_export(path, out, layout))
 
 

@@ -13,11 +13,19 @@ import sys
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import is_dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias, get_type_hints
 
 import tyro
-from tyro.conf import CascadeSubcommandArgs, DisallowNone, FlagCreatePairsOff, OmitArgPrefixes, arg
+from tyro.conf import (
+    CascadeSubcommandArgs,
+    DisallowNone,
+    FlagCreatePairsOff,
+    OmitArgPrefixes,
+    Positional,
+    arg,
+)
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 import xrgs
@@ -66,6 +74,45 @@ def _path(kind: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Path] | None:
     )
 
 
+@_REGISTRY.primitive_rule
+def _texts(kind: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[tuple[str, ...]] | None:
+    """Read the values of an option that takes any number of texts; none would mean all."""
+    if kind.type != tuple[str, ...]:
+        return None
+    least = 0 if Positional in kind.markers else 1  # commands say themselves what they lack
+    return PrimitiveConstructorSpec(
+        nargs="*",
+        metavar="TEXT ...",
+        instance_from_str=lambda words: _given_texts(words, least),
+        is_instance=lambda value: isinstance(value, tuple),
+        str_from_instance=list,
+    )
+
+
+@_REGISTRY.primitive_rule
+def _text(kind: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[str] | None:
+    """Read a text that is not empty."""
+    if kind.type is not str:
+        return None
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="TEXT",
+        instance_from_str=lambda words: _given_texts(words)[0],
+        is_instance=lambda value: isinstance(value, str),
+        str_from_instance=lambda text: [text],
+    )
+
+
+def _given_texts(words: Sequence[str], least: int = 1) -> tuple[str, ...]:
+    """Return the values of an option; ValueError for fewer than `least`, or an empty one.
+
+    A variable that is not set gives either: `xrgs-store trim --sweep $ID` would trim all cells.
+    """
+    if len(words) < least or "" in words:
+        raise ValueError("takes a value, and none or an empty one is given")
+    return tuple(words)
+
+
 def _given_path(text: str) -> Path:
     """Return the path of an option; ValueError for an empty one, as of an unset variable."""
     if not text:
@@ -100,10 +147,13 @@ def run(
     functions = {command: target} if callable(target) else target
     names = frozenset(name for function in functions.values() for name in _names(function))
     name = "[a-z][a-z_]*"
-    if overrides in {command, *sys.argv[1:2]}:
+    takes_overrides = overrides in {command, *sys.argv[1:2]} - {""}
+    if takes_overrides:
         name = "|".join({*_names(functions[overrides])} - {*known_keys()})
     assignment = re.compile(f"({name})=(.*)", re.DOTALL)
     words = _with_options(sys.argv[1:], assignment, names)
+    if takes_overrides:
+        words = _with_overrides_last(words)
     with errors_as_messages(command, assignment):
         if callable(target):
             tyro.cli(
@@ -155,6 +205,20 @@ def _with_options(
             is_file = os.access(user_path(value), os.F_OK)
             options += [option, *([value] if is_file else value.split(","))]
     return others + options
+
+
+def _with_overrides_last(words: Sequence[str]) -> list[str]:
+    """Move Hydra's overrides behind all options; tyro reads only words that stand together.
+
+    A word `A=B` behind an option may be its value, unless `A` is a key of the config.
+    """
+    others, moved = list[str](), list[str]()
+    for before, word in pairwise(["", *words]):
+        key, is_assignment, _ = word.partition("=")
+        is_key = is_assignment and (key[:1] in {"+", "~"} or key in known_keys())
+        free = is_assignment and key[:1] != "-" and before[:2] != "--"
+        (moved if is_key or free else others).append(word)
+    return others + moved
 
 
 def _option(name: str) -> str:

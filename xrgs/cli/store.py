@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -16,9 +16,13 @@ from xrgs.errors import XrgsError
 from xrgs.runtime.signals import exit_on_signal
 from xrgs.runtime.streams import say
 from xrgs.safeio.sanitize import counted
+from xrgs.splat.settings import outside_limits
 from xrgs.store.listing import CellRow
 from xrgs.store.store import Store
 from xrgs.sweep.cleaning import Plan
+
+#: The limits of an age or a size.
+_AMOUNT = {"least": 0, "finite": True}
 
 
 @dataclass(frozen=True)
@@ -35,9 +39,9 @@ class Filter:
     """Only cells in these states: done, running, planned, unfinished, failed, corrupt."""
     sweep: Annotated[tuple[str, ...], shown_as("ID ...")] = ()
     """Only cells of these sweeps; xrgs-report list has the ids."""
-    older_days: Annotated[float, shown_as("DAYS")] = 0.0
+    older_days: Annotated[float, shown_as("DAYS")] = field(default=0.0, metadata=_AMOUNT)
     """Only cells of at least this age."""
-    larger_mb: Annotated[float, shown_as("MB")] = 0.0
+    larger_mb: Annotated[float, shown_as("MB")] = field(default=0.0, metadata=_AMOUNT)
     """Only cells of at least this size."""
     store: Folder = STORE
     """The store."""
@@ -46,10 +50,13 @@ class Filter:
         """Return all cells of the store, and the chosen ones.
 
         Raises:
-            XrgsError: No cell has a name that is given, or several ids have one beginning.
+            XrgsError: No cell has a name that is given, several ids have one beginning, or an
+                amount is below 0.
         """
         from xrgs.store.listing import STATES, full_id
 
+        for message in outside_limits(self):
+            raise XrgsError(message)
         cells = Store(self.store).cell_rows()
         done = [cell for cell in cells if cell.state.name == "done"]
         named = {
@@ -187,6 +194,8 @@ def pack(cells: Filter, out: Annotated[Path, arg(metavar="FILE.tar.xz")]) -> Non
         raise XrgsError(f"--out {out}: name the archive to write, FILE.tar.xz")
     _, chosen = cells.chosen()
     done = [cell.folder for cell in chosen if cell.state.name == "done"]
+    if not done:
+        raise XrgsError("pack: none of the chosen cells is done; xrgs-store list has all")
     packed = archive.pack(Store(cells.store), done, out, Path.cwd(), cells.sweep)
     say(f"{out}: {packed}; {format_size(packed.bytes)}")
     if len(done) < len(chosen):

@@ -10,6 +10,7 @@ from __future__ import annotations
 import shlex
 import time
 from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -113,7 +114,7 @@ class _Words:
         return next((value for name, _, value in values if name == key), "")
 
     def compose(self) -> Conf:
-        """Return the config, composed once for equal words.
+        """Return a config of its own, composed once for equal words.
 
         Raises:
             XrgsError: A word is wrong, or gives several values.
@@ -124,7 +125,7 @@ class _Words:
                 words = with_quotes(key)
                 check_no_axis(words)
                 self.confs[key] = composing.compose(*words)
-        return self.confs[key]
+        return deepcopy(self.confs[key])
 
 
 def train(settings: Settings) -> None:
@@ -203,12 +204,14 @@ def _place(words: _Words) -> _Placed | None:
     from xrgs.store.trimming import home_of
     from xrgs.sweep import build_variants
     from xrgs.sweep.estimate import read_views
+    from xrgs.sweep.plan import check_plugins
 
     conf = words.compose()
     store, name = Store(conf.store), scenes.label(conf.scene)
     photographs = scenes.names(conf.scene, conf.variant.long_side)
     kind = _kind(conf)
     _say(f"{name}: {counted(len(photographs), kind)} found")
+    check_plugins([conf], imported=conf.dry_run)
     if conf.dry_run:
         store.check_room()
     else:

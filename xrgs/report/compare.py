@@ -145,28 +145,24 @@ def compare(
         The pairs, and their means over replicates and over scenes.
 
     Raises:
-        ReportError: The sweep has no such label, or there is no such metric; a cell's baseline is
+        ReportError: The sweep has no such label, or its cells no such metric; a cell's baseline is
             of another scene, variant or seed, or is not in the sweep; cells of one scene, condition
             and `variant.seed` are of different variants; the cells were scored by different
             evaluation protocols; or some cells of a condition were scored on held-out training
             views and others were not. The message names both cells, or what to choose from.
     """
     design = design or Design()
-    _check_design(design, metrics, cells)
     order = {name: at for at, name in enumerate(design.outcomes)}
     metrics = sorted(
         (m for m in metrics if not m.optional or cells[m.name].notna().any()),
         key=lambda metric: order.get(metric.name, len(order)),
     )
+    _check_design(design, metrics, cells)
     cells = _with_base(cells, against)
     _check_comparable(cells, against)
     pairs = _pairs(cells, metrics, against)
     per_scene, means = averaged(pairs, [metric.name for metric in metrics if is_ratio(metric)])
-    shares = _gaps(pairs, cells, metrics, against)
-    if shares.empty:
-        gaps_per_scene, gaps = per_scene.iloc[:0], means.iloc[:0]
-    else:
-        gaps_per_scene, gaps = averaged(shares, ())
+    gaps_per_scene, gaps = averaged(_gaps(pairs, cells, metrics, against), ())
     ablations = cells[cells["label"] != against]
     return Comparison(
         design=design,
@@ -184,14 +180,16 @@ def compare(
 
 
 def _check_design(design: Design, metrics: Sequence[Metric], cells: pd.DataFrame) -> None:
-    """Refuse an outcome that is no metric, and a headline that is no label."""
+    """Refuse an outcome that is no metric of the cells, and a headline that is no label."""
     for key, kind, wanted, choices in (
         ("outcomes", "metric", design.outcomes, [metric.name for metric in metrics]),
         ("headline", "label", design.headline, list(dict.fromkeys(cells["label"]))),
     ):
         if unknown := [name for name in wanted if name not in choices]:
-            names = ", ".join(choices)
-            raise ReportError(f"{key}={unknown[0]}: there is no such {kind}; choose from: {names}")
+            raise ReportError(
+                f"{key}={unknown[0]}: these cells have no such {kind}; choose from:"
+                f" {', '.join(choices)}"
+            )
 
 
 def _tested(means: pd.DataFrame, metrics: Sequence[Metric], design: Design) -> pd.DataFrame:

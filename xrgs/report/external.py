@@ -89,8 +89,9 @@ def with_external(sweep: Sweep, store: ReportStore, externals: Sequence[External
     cells of the lowest seed.
 
     Raises:
-        ReportError: Cells already have the label, a folder or a render is missing, or a render is
-            not an 8-bit RGB PNG of its view's size. The message names the file and the format.
+        ReportError: No cell is done, cells already have the label, a folder or a render is missing,
+            or a render is not an 8-bit RGB PNG of its view's size. The message names the file and
+            the format.
         StoreError: A `figures.json` has an unknown key, or a value that is no number above 0.
         CorruptVariant: A variant is damaged.
     """
@@ -104,6 +105,11 @@ def with_external(sweep: Sweep, store: ReportStore, externals: Sequence[External
 def _with_program(sweep: Sweep, store: ReportStore, program: External) -> Sweep:
     done = sweep.cells[sweep.cells["state"] == "done"].sort_values("seed", kind="stable")
     done = done[~done["cell_id"].isin(sweep.renders)]
+    if done.empty:
+        raise ReportError(
+            f"external={program.label}: no cell of the sweep is done, whose views its renders would"
+            " show"
+        )
     rows: list[dict[str, Any]] = []
     scores: list[dict[str, Any]] = []
     renders = dict(sweep.renders)

@@ -69,8 +69,15 @@ class CellRow:
 
     @property
     def name(self) -> str:
-        """The cell's name for people."""
-        return f"{self.id}  {self.scene} / {self.arm}"
+        """The cell's id, and its name for people: scene, label and condition, and replicate."""
+        draw = self.recorded.variant_seed if self.recorded else 0
+        parts = (
+            self.scene,
+            self.arm,
+            f"variant.seed {draw}" if draw else "",
+            "" if self.seed is None else f"seed {self.seed}",
+        )
+        return f"{self.id}  {' / '.join(filter(None, parts))}"
 
     @property
     def seed(self) -> int | None:
@@ -82,22 +89,33 @@ class CellRow:
         """The id of the cell's variant; None where the identity can't be read."""
         return self.identity.variant if self.identity else None
 
-    @cached_property
+    @property
     def stale(self) -> tuple[str, ...]:
         """Parts of the program, and the arithmetic, that differ from the cell's identity.
 
-        A sweep trains a stale cell again, under another id.
+        A sweep trains a stale cell again, under another id. For a cell `of_elsewhere` it is the
+        reason.
         """
+        return self._compared[0]
+
+    @property
+    def of_elsewhere(self) -> bool:
+        """Whether its backend or a component is not installed here, as for reading a store."""
+        return self._compared[1]
+
+    @cached_property
+    def _compared(self) -> tuple[tuple[str, ...], bool]:
+        """`stale` and `of_elsewhere`."""
         if self.identity is None:
-            return ()
+            return (), False
         try:
             changed = changed_code(self.identity, cached=True)
             here = arithmetic(str(self.identity.splat["backend"]))
-        except XrgsError as error:  # the backend is not on this machine, which only reads stores
-            return (str(error),)
+        except XrgsError as error:
+            return (str(error),), True
         if self.identity.arithmetic != here:
             changed.append(f"arithmetic ({self.identity.arithmetic}, here {here})")
-        return tuple(changed)
+        return tuple(changed), False
 
     @cached_property
     def age_s(self) -> float | None:

@@ -123,6 +123,7 @@ def plan_trim(
 def plan_gc(store: Store, cells: Sequence[CellRow], of: Sequence[str]) -> Plan:
     """Plan to remove what no sweep of the installed code needs.
 
+    A cell whose backend or component is not installed here is left alone: other machines need it.
     `of` has names of `GARBAGE`: cells of old code, failed cells and scenes, folders that were set
     aside, and variants without a cell. `cells` are all cells of the store.
     """
@@ -130,7 +131,8 @@ def plan_gc(store: Store, cells: Sequence[CellRow], of: Sequence[str]) -> Plan:
         if name not in GARBAGE:
             raise XrgsError(f"of={name}: choose from: {', '.join(GARBAGE)}")
     idle, _ = _without_running(cells)
-    old = [cell for cell in idle if cell.stale] if "old_code" in of else []
+    stale = [cell for cell in idle if cell.stale] if "old_code" in of else []
+    old = [cell for cell in stale if not cell.of_elsewhere]
     failed = [cell for cell in idle if cell.state.name == "failed"] if "failed" in of else []
     failed = [cell for cell in failed if cell not in old]
     gone = {cell.id for cell in (*old, *failed)}
@@ -144,7 +146,9 @@ def plan_gc(store: Store, cells: Sequence[CellRow], of: Sequence[str]) -> Plan:
             aside = [path for path in _paths(above) if _ASIDE.fullmatch(path.name)]
             leased = above == store.cells_folder
             items += _folders("folders that were set aside", aside, leased=leased)
-    notes = [*_recorded([cell for cell in cells if cell.id in gone])]
+    notes = _recorded([cell for cell in cells if cell.id in gone])
+    if kept := len(stale) - len(old):
+        notes.append(f"left alone, of a backend or component not installed here: {kept}")
     if "variants" in of:
         orphans, left_alone = _orphans(store, cells, gone)
         items += orphans

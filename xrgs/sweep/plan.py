@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+from xrgs import plugins
 from xrgs.config import Conf
 from xrgs.errors import XrgsError
 from xrgs.mixture.paths import TO_TRY
@@ -123,6 +124,20 @@ def check_sizes(conf: Conf) -> None:
             f"variant.long_side={side}: must be 0 (the photographs' size) or at least {least}, so"
             f" that LR views have the {SSIM_WINDOW} px a side that SSIM needs"
         )
+
+
+def check_plugins(confs: Iterable[Conf], *, imported: bool) -> None:
+    """Refuse components of other packages that are not installed.
+
+    With `imported`, those that can't be imported, or don't take their settings, are refused too.
+    """
+    used: list[tuple[str, Mapping[str, object]]] = []
+    for conf in confs:
+        used += [item for item in conf.components.plugins.items() if item not in used]
+    for name, settings in used:
+        plugins.find(name)
+        if imported:
+            plugins.check(name, settings)
 
 
 def with_variants(

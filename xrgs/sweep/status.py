@@ -206,7 +206,8 @@ def list_cells(cells: Sequence[CellRow], sort: str) -> str:
         cells = sorted(cells, key=lambda row: (row.age_s if sort == "age" else row.bytes) or 0)
     rows = []
     for row in cells:
-        marks = ["trimmed"] * row.folder.is_trimmed() + ["old code"] * bool(row.stale)
+        code = "code not installed" if row.of_elsewhere else "old code"
+        marks = ["trimmed"] * row.folder.is_trimmed() + [code] * bool(row.stale)
         state = row.state.name + (f" ({', '.join(marks)})" if marks else "")
         names = (row.id, row.scene, row.arm, str(row.seed), state)
         rows.append((*names, format_age(row.age_s), format_size(row.bytes)))
@@ -260,7 +261,7 @@ def show(store: Store, cell: CellRow) -> str:
 
 def _head(cell: CellRow) -> Iterator[str]:
     reason = f": {cell.state.reason.partition(chr(10))[0]}" if cell.state.reason else ""
-    yield f"cell {cell.name} / seed {cell.seed}"
+    yield f"cell {cell.name}"
     yield f"  {cell.state.name}{reason}, {format_age(cell.age_s)} ago, {format_size(cell.bytes)}"
     yield f"  variant {cell.variant_id}"
     yield f"  sweeps {', '.join(reversed(cell.sweeps)) or 'none'}"

@@ -133,6 +133,7 @@ class Study:
         track.check(plan[0].conf.track)
         store = Store(Path(plan[0].conf.store))
         dry_run = plan[0].conf.dry_run
+        plans.check_plugins((cell.conf for cell in plan), imported=dry_run)
         if dry_run:
             store.check_room()
         else:

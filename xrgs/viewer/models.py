@@ -10,6 +10,7 @@ import numpy as np
 
 from xrgs.errors import StoreError, XrgsError
 from xrgs.formats.files import READERS, load_gaussians
+from xrgs.formats.saved import check_is_read
 from xrgs.safeio.paths import user_path
 from xrgs.safeio.sanitize import for_line
 from xrgs.splat.cameras import Camera
@@ -117,8 +118,7 @@ def _load(word: str, store: Store) -> Model:
     try:
         cell = find_cell(word, store)
     except StoreError:
-        if file.suffix:  # of another format: the message says which are read
-            load_gaussians(file)
+        check_is_read(file)
         raise
     data = cell.dataset()
     train = [PosedView(view.name, view.tag, view.camera) for view in data.train]
