@@ -115,16 +115,3 @@ def test_phones_noise_has_its_standard_deviation_in_each_channel() -> None:
         assert luma.std() == pytest.approx(expected, rel=0.1)
     assert np.array_equal(degraded("phone", grey, seed=3), degraded("phone", grey, seed=3))
     assert not np.array_equal(degraded("phone", grey, seed=3), degraded("phone", grey, seed=4))
-
-
-def test_a_gaussian_of_phone_has_the_width_that_it_says() -> None:
-    """A line's variance grows by the blur's, 0.8^2, and by a pixel's box's, 1/12 LR px^2."""
-    line = np.zeros((80, 500, 3), np.float32)
-    line[:, 250:255] = 1
-    profile = degraded("phone", line, noise=0.0, jpeg_quality=95).mean((0, 2))
-    x = np.arange(100) + 0.5
-    profile = np.where(np.abs(x - 50.5) < 5, profile, 0)  # beyond, JPEG rounds
-    mean = (profile * x).sum() / profile.sum()
-    variance = (profile * (x - mean) ** 2).sum() / profile.sum()
-    own = 1 / 12  # the line is one LR px wide
-    assert variance == pytest.approx(own + 0.8**2 + 1 / 12, rel=0.05)

@@ -112,23 +112,6 @@ def test_undistortion_reads_each_pixel_where_the_lens_projects_its_ray(
     assert np.abs(out[..., :2] * (W, H) - expected)[inner].max() < 0.02
 
 
-@pytest.mark.parametrize("model", SERVED)
-def test_a_distorted_checkerboard_is_straight_again(model: str) -> None:
-    """The board is rendered through pycolmap's inverse, which undistortion does not use."""
-
-    def board(rays: NDArray[np.float64]) -> NDArray[np.float32]:
-        waves = np.sin(12 * rays[..., 0]) * np.sin(12 * rays[..., 1])
-        return np.repeat((0.5 + 0.4 * waves)[..., None], 3, -1).astype(np.float32)
-
-    cam = camera(model, f=80.0)
-    rays = cam.cam_from_img(pixel_grid().reshape(-1, 2)).reshape(H, W, 2)
-    lens = lens_of(cam)
-    K = lens.undistorted().K
-    expected = board(rays_of(pixel_grid(), K)[..., :2])
-    error = np.abs(undistort(board(rays), lens) - expected)[2:-2, 2:-2]
-    assert error.max() < 0.01
-
-
 @pytest.mark.parametrize("k", [-0.2, -0.02, 0.03, 0.15])
 def test_the_undistorted_image_is_zoomed_as_little_as_fills_it(k: float) -> None:
     flat = simple(k).undistorted()

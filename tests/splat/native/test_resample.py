@@ -50,15 +50,6 @@ def test_any_strides_give_the_same() -> None:
     assert all(map(torch.equal, one, other))
 
 
-def test_what_is_not_finite_stays_where_it_is() -> None:
-    image = noise(20, 30).float()
-    image[10, 15] = torch.nan
-    resized = resize(image, 100, 150, backend="native")
-    assert resized[45:60, 70:85].isnan().any()
-    assert resized[:35].isfinite().all()
-    assert resized[:, 100:].isfinite().all()
-
-
 def test_what_does_not_fit_is_refused() -> None:
     with pytest.raises(ValueError, match=r"image must be float32 on the CPU.*float64"):
         resize(noise(4, 5), 8, 10, backend="native")
