@@ -7,21 +7,16 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from scipy import ndimage, signal
+from scipy import ndimage
 
-from xrgs.composing import compose
-from xrgs.config import VariantConf
+from tests.conftest import composed
 from xrgs.mixture.degradations import DEGRADATIONS, resolve_degradation
 
-CONF = compose("variant.degradation=downsample").variant
-PHONE = CONF.phone
 
-
-def degraded(
-    how: str, high: np.ndarray, conf: VariantConf = CONF, seed: int = 0, **phone: Any
-) -> np.ndarray:
+def degraded(how: str, high: np.ndarray, seed: int = 0, **phone: Any) -> np.ndarray:
     """The LR view, with changes of `variant.phone`."""
-    conf = replace(conf, phone=replace(PHONE, **phone))
+    conf = composed().variant
+    conf = replace(conf, phone=replace(conf.phone, **phone))
     return DEGRADATIONS[how].function(high, conf, np.random.default_rng(seed))
 
 
@@ -35,13 +30,14 @@ def photo() -> np.ndarray:
 
 
 def test_auto_degrades_views_drawn_at_random_and_no_others() -> None:
+    conf = composed().variant
     kinds = {
-        tags: resolve_degradation(replace(CONF, tags=tags, degradation="auto"))
+        tags: resolve_degradation(replace(conf, tags=tags, degradation="auto"))
         for tags in ("flag", "megapixels", "distance", "sampling_rate")
     }
     assert kinds.pop("flag") == "downsample"
     assert set(kinds.values()) == {"none"}
-    assert resolve_degradation(replace(CONF, tags="distance", degradation="jpeg")) == "jpeg"
+    assert resolve_degradation(replace(conf, tags="distance", degradation="jpeg")) == "jpeg"
 
 
 def test_digital_zoom_is_the_small_copy_enlarged(photo: np.ndarray) -> None:
@@ -92,6 +88,8 @@ def test_lanczos_is_the_windowed_sinc_at_the_small_copys_pixels(photo: np.ndarra
 
 def test_phone_without_noise_is_a_blurred_box_through_jpeg(photo: np.ndarray) -> None:
     """The blur by scipy.signal, with a Gaussian of 0.8 x 5 HR px."""
+    from scipy import signal  # it takes a second to import
+
     width = 16  # px, four standard deviations
     taps = np.exp(-0.5 * (np.arange(-width, width + 1) / 4.0) ** 2)
     kernel = np.outer(taps, taps)[..., None] / taps.sum() ** 2

@@ -17,7 +17,6 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 from PIL import Image, ImageCms
-from skimage import color
 
 from tests.photos.made_files import ADOBE_RGB, DISPLAY_P3, SRGB, cmyk_profile, png, profile
 from xrgs.photos import colour, images
@@ -211,6 +210,8 @@ def test_cmyk_is_converted_by_its_profile(tmp_path: Path, form: str) -> None:
 
 
 def test_lab_is_as_scikit_image_gives_it(tmp_path: Path) -> None:
+    from skimage import color
+
     grid = np.stack(np.meshgrid(range(120, 180, 10), range(-20, 21, 5), range(-20, 21, 5)), -1)
     stored = grid.reshape(1, -1, 3)
     tifffile.imwrite(

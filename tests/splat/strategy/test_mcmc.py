@@ -7,7 +7,6 @@ import math
 import numpy as np
 import pytest
 import torch
-from scipy.integrate import quad
 from torch import Tensor
 
 from tests.splat.scenes import make_optimizer, take_step
@@ -120,6 +119,8 @@ def test_shares_are_those_of_gsplats_kernel(opacity: float) -> None:
 def test_shares_are_as_opaque_as_the_gaussian_and_have_its_integral(
     opacity: float, shares: int
 ) -> None:
+    from scipy.integrate import quad
+
     of_one = torch.tensor([opacity], dtype=torch.float64)
     shared, factor = (value.item() for value in share_out(of_one, torch.tensor([shares])))
 

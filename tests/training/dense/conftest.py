@@ -72,7 +72,7 @@ def true_scene(count: int, width: int) -> TrueScene:
     images = [
         still_life.render(
             *(still_life.solids(), textures, torch.from_numpy(K), torch.from_numpy(viewmat)),
-            *(width, height),
+            *(width, height, 1),  # what is swept has the means of 2 x 2 px and more
         )
         for viewmat in viewmats
     ]
