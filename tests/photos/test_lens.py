@@ -135,20 +135,6 @@ def test_a_wide_fisheye_keeps_60_degrees_to_each_side() -> None:
     assert lens.kept() == pytest.approx(area / 200**2, rel=1e-4)
 
 
-@pytest.mark.parametrize("quarters", [1, 2, 3])
-def test_a_turned_camera_sees_what_the_turned_image_shows(quarters: int) -> None:
-    lens = lens_of_model("OPENCV", (W, H), [60, 50, 48, 41, 0.1, 0.02, 0.01, -0.02])
-    x, y = np.random.default_rng(0).uniform(-0.5, 0.5, (2, 50))
-    px, py = lens.project(np.stack([x, y], -1)).T
-    turned, rays = {1: ((H - py, px), (-y, x)), 2: ((W - px, H - py), (-x, -y))}.get(
-        quarters, ((py, W - px), (y, -x))
-    )
-    found = lens.turned(quarters)
-    assert found.project(np.stack(rays, -1)) == pytest.approx(np.stack(turned, -1))
-    assert (found.width, found.height) == ((W, H) if quarters == 2 else (H, W))
-    assert np.diag(found.K)[:2] == pytest.approx((60, 50) if quarters == 2 else (50, 60))
-
-
 def test_a_pinhole_photograph_is_returned_as_it_is() -> None:
     image = np.random.default_rng(0).random((40, 60, 3), dtype=np.float32)
     for model, terms in (("PINHOLE", ()), ("OPENCV", (0, 0, 0, 0)), ("DIVISION", (0,))):

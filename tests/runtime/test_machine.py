@@ -15,6 +15,7 @@ import psutil
 import pytest
 import torch
 
+from tests.runtime.programs import run_python
 from xrgs.runtime import machine
 from xrgs.runtime.machine import (
     gpus,
@@ -213,14 +214,11 @@ cycle = Cycle()
 
 
 def test_nothing_is_collected_at_the_end_of_a_quick_process() -> None:
-    def output(script: str) -> str:
-        command = [sys.executable, "-c", script]
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout
-
-    assert output(_IN_A_CYCLE) == "collected"
+    assert run_python(_IN_A_CYCLE).stdout == "collected"
     quick = "from xrgs.runtime.machine import end_quickly; end_quickly()"
     at_exit = "import atexit; atexit.register(print, 'functions of atexit run')"
-    assert output(f"{quick}; {at_exit}{_IN_A_CYCLE}") == "functions of atexit run\n"
+    done = run_python(f"{quick}; {at_exit}{_IN_A_CYCLE}", check=True)
+    assert done.stdout == "functions of atexit run\n"
 
 
 def test_nothing_is_collected_in_a_block_without_collections() -> None:

@@ -41,15 +41,6 @@ def test_the_gradient_is_by_the_transpose(
     assert abs(forth - back) <= 1e-6 * terms
 
 
-def test_any_strides_give_the_same() -> None:
-    planes = noise(3, 20).expand(-1, -1, 3).permute(2, 1, 0).float()  # [3, 20, 3] of odd strides
-    assert not planes.is_contiguous()
-    slope = torch.ones(1, 1, 3).expand(9, 40, 3)
-    one = value_and_gradient(planes, slope)
-    other = value_and_gradient(planes.contiguous(), slope.contiguous())
-    assert all(map(torch.equal, one, other))
-
-
 def test_what_does_not_fit_is_refused() -> None:
     with pytest.raises(ValueError, match=r"image must be float32 on the CPU.*float64"):
         resize(noise(4, 5), 8, 10, backend="native")

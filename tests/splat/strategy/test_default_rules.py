@@ -201,15 +201,3 @@ def test_the_group_of_a_gaussian_without_gradients_is_the_last() -> None:
 
 
 # --- state --------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", ["grad2d_sum", "visible_count"])
-def test_state_of_other_gaussians_is_refused(name: str) -> None:
-    strategy = strategy_of(uniform(4))
-    expected = rf"{name} must be torch.float32 \[1, 4\], got "
-    for wrong, got in (
-        (torch.zeros(1, 3), r".* \[1, 3\]"),
-        (torch.zeros(1, 4).double(), "torch.float64"),
-    ):
-        with pytest.raises(ValueError, match=expected + got):
-            strategy.load_state_dict(strategy.state_dict() | {name: wrong})

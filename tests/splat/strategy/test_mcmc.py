@@ -206,17 +206,6 @@ def test_removed_gaussians_leave_the_others_as_they_are() -> None:
     assert torch.equal(strategy.gaussians.means, values["means"][~mask])
 
 
-def test_a_restored_strategy_draws_what_the_first_one_would() -> None:
-    values = random_start(60)
-    first = strategy_of(values, seed=1)
-    after_step(first, 600)
-    again = strategy_of({name: first.gaussians[name].detach() for name in PARAMETERS}, seed=2)
-    again.load_state_dict(first.state_dict())
-    for strategy in (first, again):
-        after_step(strategy, 700)
-    assert all(torch.equal(first.gaussians[name], again.gaussians[name]) for name in PARAMETERS)
-
-
 def test_groups_and_a_missing_budget_are_refused() -> None:
     with pytest.raises(ValueError, match=r"^settings\.budget must be above 0"):
         strategy_of(random_start(5), DensifySettings())
