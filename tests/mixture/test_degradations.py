@@ -87,15 +87,14 @@ def test_lanczos_is_the_windowed_sinc_at_the_small_copys_pixels(photo: np.ndarra
 
 
 def test_phone_without_noise_is_a_blurred_box_through_jpeg(photo: np.ndarray) -> None:
-    """The blur by scipy.signal, with a Gaussian of 0.8 x 5 HR px."""
-    from scipy import signal  # it takes a second to import
-
+    """The blur by numpy's FFT, with a Gaussian of 0.8 x 5 HR px."""
     width = 16  # px, four standard deviations
     taps = np.exp(-0.5 * (np.arange(-width, width + 1) / 4.0) ** 2)
     kernel = np.outer(taps, taps)[..., None] / taps.sum() ** 2
     padded = np.pad(photo.astype(np.float64), ((width, width), (width, width), (0, 0)), "symmetric")
-    blurred = signal.fftconvolve(padded, kernel, mode="valid", axes=(0, 1))
-    expected = degraded("box", blurred.astype(np.float32))
+    image, blur = (np.fft.rfft2(of, padded.shape[:2], axes=(0, 1)) for of in (padded, kernel))
+    blurred = np.fft.irfft2(image * blur, padded.shape[:2], axes=(0, 1))
+    expected = degraded("box", blurred[2 * width :, 2 * width :].astype(np.float32))
     found = degraded("phone", photo, noise=0.0, jpeg_quality=95)
     assert np.abs(found - expected).mean() < 0.01
     stream = io.BytesIO()

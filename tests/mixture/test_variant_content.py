@@ -17,12 +17,6 @@ pytestmark = pytest.mark.slow
 Build = Callable[..., Variant]
 
 
-@pytest.fixture(scope="module")
-def procedural_variant(build_in: Build, shared_store: Path) -> Variant:
-    """Ten views of the embedded scene with the default settings, at 252 px."""
-    return build_in(shared_store, scene_conf("procedural", name="procedural", views=10))
-
-
 def select(built: Variant, split: str, tag: str) -> list[View]:
     return [view for view in built.views if (view.split, view.tag) == (split, tag)]
 
@@ -44,16 +38,16 @@ def test_every_8th_view_is_held_out_and_a_fraction_of_the_rest_stays_hr(
     assert made.held_out
     assert made.factor == 5
     assert [v.name for v in select(made, "test", "HR")] == ["view_000", "view_008"]
-    assert len(select(made, "train", "HR")) == round(0.3 * 8)
-    assert len(select(made, "train", "LR")) == 8 - round(0.3 * 8)
-    assert len([v for v in made.views if v.split != "original"]) == 10
+    assert len(select(made, "train", "HR")) == round(0.3 * 14)
+    assert len(select(made, "train", "LR")) == 14 - round(0.3 * 14)
+    assert len([v for v in made.views if v.split != "original"]) == 16
     assert [(v.split, v.name) for v in made.views] == sorted((v.split, v.name) for v in made.views)
 
 
 def test_the_cameras_are_the_exact_ones_up_to_a_similarity(procedural_variant: Variant) -> None:
     """At 250 px, 0.8% and 0.17 degrees were measured; all HR, intrinsics known, gives 0.46%."""
     error = procedural_variant.report["pose_error"]
-    assert procedural_variant.report["registered"] == 10
+    assert procedural_variant.report["registered"] == 16
     assert error["position_percent"] < 1.5
     assert error["rotation_degrees"] < 0.4
 
@@ -78,7 +72,7 @@ def test_the_report_says_how_sfm_went(procedural_variant: Variant) -> None:
     assert len(procedural_variant.points) == len(procedural_variant.colors)
     assert 0 < report["reprojection_error_px"] < 1.5
     assert report["not_registered"] == []
-    assert report["hr_sizes"] == {"250x185": 10}
+    assert report["hr_sizes"] == {"250x185": 16}
     assert report["seconds"] > 0
     assert "Feature extraction" in (procedural_variant.folder / "colmap.log").read_text()
 

@@ -71,15 +71,19 @@ GROUPS = {
 }
 
 
+def write_groups(root: Path, own: str | None, groups: dict[str, str]) -> None:
+    files = {f"sys/fs/cgroup/{name}": text for name, text in groups.items()}
+    if own is not None:
+        files["proc/self/cgroup"] = own
+    for name, text in files.items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text(f"{text}\n")
+
+
 @pytest.mark.parametrize("case", GROUPS)
 def test_the_quota_is_the_least_of_the_control_groups(tmp_path: Path, case: str) -> None:
     own, files, quota = GROUPS[case]
-    if own is not None:
-        files = {f"sys/fs/cgroup/{name}": text for name, text in files.items()}
-        files["proc/self/cgroup"] = own
-    for name, text in files.items():
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_text(f"{text}\n")
+    write_groups(tmp_path, own, files)
     assert machine.cpu_quota(tmp_path) == quota
 
 
@@ -94,11 +98,7 @@ def test_the_quota_is_the_least_of_the_control_groups(tmp_path: Path, case: str)
 def test_the_memory_is_the_least_of_the_machine_and_its_control_groups(
     tmp_path: Path, own: str, files: dict[str, str], limit: int | None
 ) -> None:
-    for name, text in files.items():
-        (tmp_path / "sys/fs/cgroup" / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / "sys/fs/cgroup" / name).write_text(f"{text}\n")
-    (tmp_path / "proc/self").mkdir(parents=True)
-    (tmp_path / "proc/self/cgroup").write_text(own)
+    write_groups(tmp_path, own, files)
     assert machine.usable_memory(tmp_path) == (limit or psutil.virtual_memory().total)
 
 

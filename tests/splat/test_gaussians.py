@@ -21,23 +21,10 @@ def cloud() -> Cloud:
     return rng.normal(size=(30, 3)), rng.integers(0, 256, (30, 3), dtype=np.uint8)
 
 
-def start(
-    points: Any,
-    colors: Any,
-    *,
-    init_opacity: float = 0.1,
-    init_scale: float = 1.0,
-    sh_degree: int = 3,
-    seed: int = 0,
-) -> Gaussians:
-    return Gaussians.from_points(
-        points,
-        colors,
-        init_opacity=init_opacity,
-        init_scale=init_scale,
-        sh_degree=sh_degree,
-        generator=torch.Generator().manual_seed(seed),
-    )
+def start(points: Any, colors: Any, **options: Any) -> Gaussians:
+    options = {"init_opacity": 0.1, "sh_degree": 3, **options}
+    generator = torch.Generator().manual_seed(0)
+    return Gaussians.from_points(points, colors, generator=generator, **options)
 
 
 def test_start_is_gsplats(cloud: Cloud) -> None:

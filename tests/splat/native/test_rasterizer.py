@@ -250,6 +250,7 @@ def test_gradients_are_nearly_as_exact_as_float32_in_torch() -> None:
         assert errors["native"][name] <= 3 * errors["torch"][name], name
 
 
+@pytest.mark.slow
 @given(
     seed=st.integers(0, 2**31),
     count=st.integers(0, 80),

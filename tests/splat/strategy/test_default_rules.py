@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import pytest
 import torch
@@ -17,16 +18,7 @@ from xrgs.splat.strategy.default import DefaultStrategy
 
 WIDTH, HEIGHT = SIZES["HR"]
 NO_HOOKS = StrategyHooks()
-
-
-def strategy_of(
-    values: dict[str, Tensor],
-    settings: DensifySettings | None = None,
-    *,
-    seed: int = 0,
-    groups: Groups | None = None,
-) -> DefaultStrategy:
-    return make_strategy(values, settings, scene_scale=SCENE_SCALE, seed=seed, groups=groups)
+strategy_of = partial(make_strategy, scene_scale=SCENE_SCALE)
 
 
 def uniform(count: int, *, scale: float = 0.01, opacity: float = 0.5) -> dict[str, Tensor]:
