@@ -30,7 +30,7 @@ import sys, time
 from pathlib import Path
 from xrgs.runtime import lease
 folder, log = Path(sys.argv[1]), Path(sys.argv[2])
-end = time.monotonic() + 1
+end = time.monotonic() + 0.5
 while time.monotonic() < end:
     held = lease.acquire(folder, "cell")
     if held is not None:
