@@ -120,7 +120,7 @@ def test_training_lowers_the_loss(data: Dataset, short: Conf) -> None:
 
 
 class HookRecorder(components.Component):
-    """Asserts what hooks are called with, and bakes black Gaussians."""
+    """Asserts that it knows the number of Gaussians, and bakes black ones."""
 
     def __init__(self) -> None:
         self.sizes: list[int] = []
@@ -128,26 +128,6 @@ class HookRecorder(components.Component):
     def before_render(self, activated: ActivatedGaussians, step: Step) -> ActivatedGaussians:
         assert len(activated.means) == self.sizes[-1]
         return activated
-
-    def pixel_weights(self, step: Step) -> torch.Tensor:
-        return torch.ones(step.view.image.shape[:2])
-
-    def modify_loss(
-        self, loss: torch.Tensor, image: torch.Tensor, gaussians: Gaussians, step: Step
-    ) -> torch.Tensor:
-        assert image.shape == step.view.image.shape
-        return loss
-
-    def needs_backward(self, loss: torch.Tensor, step: Step) -> bool:
-        assert loss.requires_grad
-        return True
-
-    def after_backward(self, gaussians: Gaussians, step: Step) -> None:
-        assert gaussians.scales.grad is not None
-
-    def densification_grad2d(self, gradient: torch.Tensor, step: Step) -> torch.Tensor:
-        assert len(gradient) == self.sizes[-1]
-        return gradient
 
     def on_gaussians_changed(self, gaussians: Gaussians) -> None:
         self.sizes.append(len(gaussians))
