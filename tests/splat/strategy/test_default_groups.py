@@ -175,11 +175,3 @@ def test_the_reset_is_above_every_threshold() -> None:
         assert refinement.reset > 0
         highest = torch.sigmoid(gaussians.opacities.detach()).max().item()
         assert highest == pytest.approx(2 * COARSE.prune_opacity)
-
-
-def test_what_names_no_group_and_no_way_to_decide_is_refused() -> None:
-    rng = np.random.default_rng(4)
-    with pytest.raises(KeyError, match="LR"):
-        ours(values_of(3, rng), views_of("l", 3, rng), Groups({"HR": FINE}, "per_class"))
-    with pytest.raises(ValueError, match="decide=everybody"):
-        Groups({"HR": FINE}, "everybody")
