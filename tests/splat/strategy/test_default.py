@@ -110,8 +110,8 @@ def test_a_refinement_is_gsplats(
 
 
 @pytest.mark.slow
-def test_a_run_of_1500_steps_is_gsplats() -> None:
-    steps = 1500
+def test_a_run_of_3000_steps_is_gsplats() -> None:
+    steps = 3000
     config = DensifySettings().scaled(steps)
     rng = np.random.default_rng(0)
     values = random_start(150, rng)
