@@ -348,13 +348,13 @@ def test_given_poses_replace_sfm_and_are_scaled_for_lr_views(
     assert made.report["not_registered"] == names[-1:]
     assert {view.name for view in made.views} == set(names[:-1])
     exact = procedural.intrinsics(160, 120)
-    matrices = procedural.viewmats(VIEWS)
+    true = procedural.viewmats(VIEWS)
     # Given poses are moved to a world of their own, rigidly and all alike.
     first = made.views[0]
-    to_given = np.linalg.inv(first.viewmat) @ matrices[number(first)]
+    to_given = np.linalg.inv(first.viewmat) @ true[number(first)]
     assert np.allclose(to_given[:3, :3] @ to_given[:3, :3].T, np.eye(3), atol=1e-9)
     for view in made.views:
-        assert np.allclose(view.viewmat @ to_given, matrices[number(view)], atol=1e-9)
+        assert np.allclose(view.viewmat @ to_given, true[number(view)], atol=1e-9)
         scale = view.width / 160
         assert scale in {1, 1 / 5}
         assert np.allclose(view.K, np.diag([scale, scale, 1]) @ exact, atol=1e-9)

@@ -7,9 +7,15 @@ from xrgs.config import SceneConf, VariantConf
 
 
 def scene_conf(kind: str, path: object = None, *, name: str = "", views: int = 24) -> SceneConf:
-    file, black = None if path is None else str(path), (0.0, 0.0, 0.0)
-    others = {"masks": None, "alpha": "composite", "background": black}
-    return SceneConf(kind=kind, path=file, name=name, views=views, **others)
+    return SceneConf(
+        kind=kind,
+        path=None if path is None else str(path),
+        name=name,
+        views=views,
+        masks=None,
+        alpha="composite",
+        background=(0.0, 0.0, 0.0),
+    )
 
 
 def whole_sizes() -> VariantConf:

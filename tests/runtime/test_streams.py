@@ -59,8 +59,9 @@ def test_the_work_goes_on_without_a_reader(
     tmp_path: Path, gone: Callable[[], AbstractContextManager[int]], how: str
 ) -> None:
     with gone() as there:
-        options = {"stdout": there, "stderr": there, "capture_output": False}
-        done = run_python(_SCRIPT, how, cwd=tmp_path, **options)
+        done = run_python(
+            _SCRIPT, how, cwd=tmp_path, stdout=there, stderr=there, capture_output=False
+        )
     assert (done.returncode == 0) == (how == "guard")
     assert (tmp_path / "done").exists() == (how == "guard")
 
@@ -84,8 +85,7 @@ with open("file", "w") as file:
         for descriptor in closed:
             os.close(descriptor)
 
-    options = {"stdin": subprocess.DEVNULL, "check": True, "preexec_fn": close}
-    done = run_python(script, cwd=tmp_path, **options)
+    done = run_python(script, cwd=tmp_path, check=True, stdin=subprocess.DEVNULL, preexec_fn=close)
     assert (tmp_path / "file").read_text() == "False ''"
     said = "text\nof a child\n"
     assert (done.stdout, done.stderr) == ("" if 1 in closed else said, "" if 2 in closed else said)

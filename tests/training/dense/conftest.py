@@ -67,7 +67,7 @@ def true_depths(rays: Array, viewmat: Array) -> Array:
 def true_scene(count: int, width: int, samples: int = 1) -> TrueScene:
     """Render views of the embedded scene, `width` px wide, two thirds at `FACTOR` times less.
 
-    A pixel has the mean of `samples` x `samples`.
+    A pixel of an HR view has the mean of `samples` x `samples`.
     """
     height = width * 3 // 4
     K, viewmats = procedural.intrinsics(width, height), procedural.viewmats(count)
@@ -75,9 +75,9 @@ def true_scene(count: int, width: int, samples: int = 1) -> TrueScene:
     images = [
         still_life.render(
             *(still_life.solids(), textures, torch.from_numpy(K), torch.from_numpy(viewmat)),
-            *(width, height, samples),
+            *(width, height, samples if number % 3 == 0 else 1),
         )
-        for viewmat in viewmats
+        for number, viewmat in enumerate(viewmats)
     ]
     points, colors = _points(K, viewmats, images)
     world = normalize_scene(viewmats, points)
