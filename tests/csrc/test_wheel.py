@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.runtime.programs import run_python
+
 ROOT = Path(__file__).resolve().parents[2]
 
 #: Prints the digest of an image and its gradients for each instruction set that fuses products and
@@ -81,7 +83,6 @@ def test_a_machine_without_a_compiler_builds_the_same_kernels(tmp_path: Path) ->
 def digests(package: Path | None, folder: Path) -> str:
     """What DIGESTS prints with the package of a folder, or with the installed one."""
     program = DIGESTS if package is None else IMPORT_FROM.format(str(package)) + DIGESTS
-    command = [sys.executable, "-P", "-c", program]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    done = run_python(program, cwd=folder)
     assert done.returncode == 0, done.stderr
     return done.stdout

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from numpy.lib.stride_tricks import sliding_window_view
 from torch import Tensor
 
+from tests.splat.scenes import similar_pair
 from xrgs.evaluation import metrics
 from xrgs.evaluation.lpips import weights
 from xrgs.photos import masks
@@ -37,13 +38,8 @@ MORE_IS_BETTER = {
 
 
 def pair(height: int = 40, width: int = 53) -> tuple[Tensor, Tensor]:
-    generator = torch.Generator().manual_seed(0)
-    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-    waves = 0.5 + 0.3 * torch.sin(x / 5.0 + y / 3.0)[..., None]
-    first, second = (
-        (waves + 0.2 * (torch.rand(height, width, 3, generator=generator) - 0.5)) for _ in range(2)
-    )
-    return first, second
+    first, second = similar_pair(height, width)
+    return first.float(), second.float()
 
 
 def ssim_map_by_definition(image: Tensor, target: Tensor) -> np.ndarray:

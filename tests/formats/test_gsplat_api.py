@@ -379,15 +379,8 @@ def test_black_gaussians_have_gradients() -> None:
 
 
 def arguments(**changes: Any) -> dict[str, Any]:
-    """Arguments of 80 Gaussians and two cameras, some of them changed."""
-    generator = torch.Generator().manual_seed(0)
-    shapes = {"means": (80, 3), "quats": (80, 4), "scales": (80, 3), "opacities": (80,)}
-    tensors = {name: torch.rand(shape, generator=generator) for name, shape in shapes.items()} | {
-        "colors": torch.rand(80, 3, generator=generator)
-    }
-    Ks = torch.tensor([[40.0, 0, 18], [0, 38, 15], [0, 0, 1]]).repeat(2, 1, 1)
-    views = {"viewmats": torch.eye(4).repeat(2, 1, 1), "Ks": Ks, "width": 37, "height": 29}
-    return {**tensors, **views, "backgrounds": torch.zeros(2, 3), **changes}
+    """Arguments of 80 Gaussians and two cameras in float32, some of them changed."""
+    return scene().to(torch.float32).arguments() | changes
 
 
 def test_the_signature_is_gsplats() -> None:
@@ -484,7 +477,7 @@ def test_no_gaussians_give_the_background(backend: str, packed: bool) -> None:
         render_mode="RGB+ED",
         backend=backend,
     )
-    assert torch.equal(image[..., :3], background[:, None, None].expand(2, 29, 37, 3))
+    assert torch.equal(image[..., :3], background[:, None, None].expand(2, HEIGHT, WIDTH, 3))
     assert not image[..., 3:].any()
     assert not alpha.any()
     assert meta["radii"].numel() == 0
@@ -493,14 +486,12 @@ def test_no_gaussians_give_the_background(backend: str, packed: bool) -> None:
 @pytest.mark.parametrize(("backend", "dtype"), [("native", "bfloat16"), ("torch", "float16")])
 def test_autocast_changes_nothing(backend: str, dtype: str) -> None:
     """Autocast rounds matrix products to 8 or 11 bits; gsplat's kernels compute in float32."""
-    scene = arguments(backend=backend, render_mode="RGB+ED")
-    scene["means"][:, 2] += 2
-    trained = scene["means"].requires_grad_()
-
-    wanted = rasterization(**scene)
+    given = arguments(backend=backend, render_mode="RGB+ED")
+    trained = given["means"].requires_grad_()
+    wanted = rasterization(**given)
     with torch.autocast("cpu", dtype=getattr(torch, dtype)):
         assert (trained.detach() @ torch.eye(3)).dtype is getattr(torch, dtype)
-        got = rasterization(**scene)
+        got = rasterization(**given)
     # The backward pass belongs outside, by torch's documentation.
     gradients = [torch.autograd.grad(image.sum(), trained)[0] for image, _, _ in (got, wanted)]
     values = [[image, alpha, meta["means2d"]] for image, alpha, meta in (got, wanted)]
@@ -512,7 +503,6 @@ def test_autocast_changes_nothing(backend: str, dtype: str) -> None:
 @pytest.mark.parametrize(("backend", "sh_degree"), [("native", 1), ("torch", None)])
 def test_tensors_that_are_not_contiguous(backend: str, sh_degree: int | None) -> None:
     usual = arguments(sh_degree=sh_degree, backend=backend)
-    usual["means"][:, 2] += 2
     if sh_degree:
         usual["colors"] = torch.rand(80, 4, 3, generator=torch.Generator().manual_seed(1))
     strided = dict(usual)

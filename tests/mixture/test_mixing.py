@@ -15,6 +15,7 @@ import pycolmap
 import pytest
 import yaml
 
+from tests.mixture.poses.written import write_model
 from tests.photos.scene_confs import scene_conf
 from xrgs import config
 from xrgs.config import VariantConf
@@ -331,41 +332,29 @@ def test_every_variant_in_conf_is_of_one_tag_or_degradation() -> None:
 # what the user gives
 
 
-def write_poses(folder: Path, names: Sequence[str]) -> None:
-    """Write a model with the embedded scene's exact cameras, at twice its photographs' size."""
-    model = pycolmap.Reconstruction()
-    fx, fy, cx, cy = (procedural.intrinsics(320, 240)[i] for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    camera = pycolmap.Camera(
-        camera_id=1, model="PINHOLE", width=320, height=240, params=[fx, fy, cx, cy]
-    )
-    model.add_camera_with_trivial_rig(camera)
-    for i, name in enumerate(names):
-        matrix = procedural.viewmats(VIEWS)[int(name[-3:])]
-        image = pycolmap.Image(name=f"{name}.jpg", camera_id=1, image_id=i + 1)
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(matrix[:3]))
-    for point in np.random.default_rng(0).uniform((-1, -1, 5), (1, 1, 6), (20, 3)):
-        model.add_point3D(point, pycolmap.Track())
-    folder.mkdir()
-    model.write_binary(folder)
-
-
 def test_given_poses_replace_sfm_and_are_scaled_for_lr_views(
     mix: Mix, rendered: Scene, given: list[list[str]], tmp_path: Path
 ) -> None:
+    """The exact cameras of the embedded scene, of twice its photographs' size."""
     names = list(rendered.files)
-    write_poses(tmp_path / "poses", names[:-1])
+    K = procedural.intrinsics(320, 240)
+    params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
+    camera = pycolmap.Camera(model="PINHOLE", width=320, height=240, params=params)
+    matrices = {f"{n}.jpg": procedural.viewmats(VIEWS)[int(n[-3:])] for n in names[:-1]}
+    points = np.random.default_rng(0).uniform((-1, -1, 5), (1, 1, 6), (20, 3))
+    write_model(tmp_path / "poses", camera, matrices, points)
     made = mix(poses=str(tmp_path / "poses"))
     assert given == [], "no SfM, nor one of the undegraded photographs"
     assert made.report["not_registered"] == names[-1:]
     assert {view.name for view in made.views} == set(names[:-1])
     exact = procedural.intrinsics(160, 120)
-    matrices = procedural.viewmats(VIEWS)
+    true = procedural.viewmats(VIEWS)
     # Given poses are moved to a world of their own, rigidly and all alike.
     first = made.views[0]
-    to_given = np.linalg.inv(first.viewmat) @ matrices[number(first)]
+    to_given = np.linalg.inv(first.viewmat) @ true[number(first)]
     assert np.allclose(to_given[:3, :3] @ to_given[:3, :3].T, np.eye(3), atol=1e-9)
     for view in made.views:
-        assert np.allclose(view.viewmat @ to_given, matrices[number(view)], atol=1e-9)
+        assert np.allclose(view.viewmat @ to_given, true[number(view)], atol=1e-9)
         scale = view.width / 160
         assert scale in {1, 1 / 5}
         assert np.allclose(view.K, np.diag([scale, scale, 1]) @ exact, atol=1e-9)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from xrgs.composing import compose
+from tests.photos.scene_confs import whole_sizes
 from xrgs.errors import UnreadableError, XrgsError
 from xrgs.mixture.photographs import (
     assign_cameras,
@@ -17,8 +17,6 @@ from xrgs.mixture.photographs import (
 )
 from xrgs.photos import images
 from xrgs.photos.scenes import Scene
-
-CONF = compose("variant.long_side=0", "variant.factor=2").variant
 
 
 def write_photograph(
@@ -84,7 +82,7 @@ def test_a_degraded_copy_for_sfm_keeps_the_aspect_ratio(
 ) -> None:
     """154 x 103 px at a fifth are 31 x 21, whose pixels are no squares of the photograph."""
     files = {name: write_photograph(tmp_path / f"{name}.png", size) for name in "ab"}
-    conf = replace(CONF, factor=5)
+    conf = replace(whole_sizes(), factor=5)
     photos = prepare_hr_views(Scene("x", "", files), conf, tmp_path, for_sfm=True)
     write_degraded(photos, [0], conf, "sfm_lr")
     assert photos.size("sfm_lr", 0) == expected
@@ -110,7 +108,7 @@ def test_exif_tells_cameras_lenses_and_how_they_were_held(tmp_path: Path) -> Non
 def test_all_are_shrunk_by_one_scale(tmp_path: Path) -> None:
     sizes = [(200, 100), (100, 200), (120, 60), (50, 50)]
     files = [write_photograph(tmp_path / f"{i}.png", size) for i, size in enumerate(sizes)]
-    conf = replace(CONF, long_side=100)
+    conf = replace(whole_sizes(), long_side=100)
     photos = prepare_hr_views(Scene("x", "", {file.stem: file for file in files}), conf, tmp_path)
     assert [p.hr.resized for p in photos.all] == [(100, 50), (50, 100), (60, 30), (25, 25)]
     assert [(p.hr.width, p.hr.height) for p in photos.all][-1] == (24, 24)
@@ -134,7 +132,7 @@ def test_where_all_are_too_small_the_error_names_the_keys_that_help(
     tmp_path: Path, long_side: int, factor: int, helps: str
 ) -> None:
     files = [write_photograph(tmp_path / f"{name}.png", (60, 34)) for name in "ab"]
-    conf = replace(CONF, long_side=long_side, factor=factor)
+    conf = replace(whole_sizes(), long_side=long_side, factor=factor)
     with pytest.raises(
         XrgsError, match=r"scene x: 0 photograph.*a\.png, b\.png \(variant"
     ) as error:
@@ -152,7 +150,7 @@ def test_a_damaged_photograph_is_left_out_and_sets_no_size(tmp_path: Path, damag
         tmp_path / "b.png",
         write_photograph(tmp_path / "c.png"),
     ]
-    conf = replace(CONF, long_side=60)
+    conf = replace(whole_sizes(), long_side=60)
     photos = prepare_hr_views(scene_of(*files), conf, tmp_path)
     assert photos.names == ["a", "c"]
     assert [photo.hr.resized for photo in photos.all] == [(60, 40)] * 2
@@ -160,7 +158,7 @@ def test_a_damaged_photograph_is_left_out_and_sets_no_size(tmp_path: Path, damag
     (note,) = photos.notes
     assert note.startswith("left out: b.png (unreadable or truncated")
     with pytest.raises(XrgsError, match=r"scene x: 1 photograph.*needed: b\.png \(unreadable"):
-        prepare_hr_views(scene_of(*files[:2]), CONF, tmp_path)
+        prepare_hr_views(scene_of(*files[:2]), whole_sizes(), tmp_path)
 
 
 @pytest.mark.parametrize("failing", ["header", "decode"])
@@ -178,7 +176,7 @@ def test_a_photograph_that_cant_be_read_now_is_not_left_out(
 
     monkeypatch.setattr(images, failing, fails)
     with pytest.raises(UnreadableError, match=r"b\.png"):
-        prepare_hr_views(scene_of(*files), CONF, tmp_path)
+        prepare_hr_views(scene_of(*files), whole_sizes(), tmp_path)
 
 
 @pytest.mark.parametrize(("suffix", "kind"), [("png", np.uint16), ("tif", np.float32)])
@@ -188,7 +186,9 @@ def test_a_depth_map_is_left_out_beside_photographs(
     files = [write_photograph(tmp_path / f"{name}.png") for name in "ab"]
     depth = tmp_path / f"depth.{suffix}"
     Image.fromarray(np.zeros((400, 600), kind)).save(depth)
-    photos = prepare_hr_views(scene_of(*files, depth), replace(CONF, long_side=60), tmp_path)
+    photos = prepare_hr_views(
+        scene_of(*files, depth), replace(whole_sizes(), long_side=60), tmp_path
+    )
     assert [photo.hr.resized for photo in photos.all] == [(60, 40)] * 2
     (note,) = photos.notes
     assert note.startswith(f"left out: depth.{suffix} (taken for a depth map: it has one channel")
@@ -207,7 +207,7 @@ def write_cutout(file: Path, hidden: int) -> Path:
 def test_transparent_pixels_get_the_background_alone(tmp_path: Path, alpha: str) -> None:
     files = [write_cutout(tmp_path / f"{hidden}.png", hidden) for hidden in (20, 230)]
     scene = replace(scene_of(*files), alpha=alpha, background=(0.2, 0.2, 0.2))
-    photos = prepare_hr_views(scene, CONF, tmp_path)
+    photos = prepare_hr_views(scene, whole_sizes(), tmp_path)
     for i in (0, 1):
         view = photos.read("hr" if alpha == "composite" else "shown", i)
         assert np.abs(view[:, :15] - 0.2).max() < 0.003

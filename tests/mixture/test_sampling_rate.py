@@ -146,15 +146,6 @@ def test_the_depth_is_the_median_of_the_observed_points() -> None:
     assert sampling_rate.median_depth(points, moved, LENS, own) == 15
 
 
-def test_the_rate_is_focal_length_over_depth() -> None:
-    """300 px at depth 4 are 75 px per unit, and 100 px at depth 2 are 50, which is 2/3 of it."""
-    K = {f: K_of(f, f) for f in (100.0, 300.0)}
-    rates = [sampling_rate.sampling_rate(K[300.0], 4), sampling_rate.sampling_rate(K[100.0], 2)]
-    assert rates == pytest.approx([75, 50])
-    assert sampling_rate.relative_to_largest(rates) == pytest.approx([1, 2 / 3])
-    assert sampling_rate.sampling_rate(K_of(40, 90), 3) == pytest.approx(20)
-
-
 def test_points_on_the_border_of_the_image_and_close_to_the_camera_count() -> None:
     """Pixels 0 and 100 of 100 are the image's own border; depth is bounded by 0 alone."""
     border = [[-50 / 90, 0, 1], [50 / 90, 0, 1], [0, -40 / 90, 1], [0, 40 / 90, 1]]

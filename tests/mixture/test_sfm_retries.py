@@ -6,6 +6,7 @@ import zlib  # noqa: F401  pycolmap corrupts the heap where it is imported befor
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -15,6 +16,7 @@ from PIL import Image
 from scipy.ndimage import map_coordinates
 from skimage import data
 
+from tests.mixture.poses.written import write_model
 from xrgs.config import SceneConf, SfmConf, VariantConf
 from xrgs.mixture import poses, sfm, sfm_retries
 from xrgs.mixture.photographs import PhotoCollection, prepare_hr_views, write_degraded
@@ -24,6 +26,7 @@ from xrgs.photos.lens import Lens
 from xrgs.photos.scenes import Scene
 
 Make = Callable[..., VariantConf]
+Register = Callable[..., sfm_retries.Registration]
 SIZE = (240, 180)
 DEPTH = 5.0
 CAMERA = pycolmap.Camera(
@@ -42,6 +45,25 @@ def photos(configured: Make, stereo_scene: SceneConf, tmp_path: Path) -> PhotoCo
     made = prepare_hr_views(scene, conf, tmp_path, for_sfm=True)
     write_degraded(made, [1], conf, "sfm_lr")
     return made
+
+
+@pytest.fixture
+def register(
+    photos: PhotoCollection, sfm_conf: SfmConf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Register:
+    """(what SfM gives at each attempt, refusal, photos, **settings) -> `register` of `photos`."""
+
+    def registered(
+        reconstruct: Callable[..., Reconstruction],
+        refuse: Callable[[Reconstruction], str] = lambda _: "",
+        given: PhotoCollection = photos,
+        **settings: Any,
+    ) -> sfm_retries.Registration:
+        monkeypatch.setattr(sfm, "reconstruct", reconstruct)
+        conf = replace(sfm_conf, **settings)
+        return sfm_retries.register(given, [1], conf, tmp_path, refuse)
+
+    return registered
 
 
 def attempt(conf: SfmConf) -> sfm_retries.Attempt:
@@ -83,16 +105,10 @@ def test_attempts_follow_until_one_is_accepted(
 
 @pytest.mark.parametrize(("second", "refused"), [(2, ""), (2, "no")])
 def test_an_accepted_attempt_that_lacks_a_view_is_followed_by_one_more(
-    photos: PhotoCollection,
-    sfm_conf: SfmConf,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    second: int,
-    refused: str,
+    register: Register, second: int, refused: str
 ) -> None:
     results, refusals = iter([registered(1), registered(second)]), iter(["", refused])
-    monkeypatch.setattr(sfm, "reconstruct", lambda *_: next(results))
-    done = sfm_retries.register(photos, [1], sfm_conf, tmp_path, lambda _: next(refusals))
+    done = register(lambda *_: next(results), lambda _: next(refusals))
     assert [a["attempt"] for a in done.attempts] == ["configured", "relaxed"]
     assert done.refused == ""
     better = second == 2 and not refused
@@ -102,18 +118,14 @@ def test_an_accepted_attempt_that_lacks_a_view_is_followed_by_one_more(
 
 @pytest.mark.parametrize("fallbacks", [True, False])
 def test_where_all_are_refused_the_first_with_most_views_is_returned(
-    photos: PhotoCollection,
-    sfm_conf: SfmConf,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    fallbacks: bool,
+    register: Register, fallbacks: bool
 ) -> None:
     results = iter([registered(*found) for found in ((0, 0), (2, 10), (1, 30), (0, 0), (2, 40))])
-    monkeypatch.setattr(sfm, "reconstruct", lambda *_: next(results))
-    conf = replace(sfm_conf, fallbacks=fallbacks)
-    done = sfm_retries.register(
-        photos, [1], conf, tmp_path, lambda model: f"{model.report['points']} are too few"
-    )
+
+    def refuse(model: Reconstruction) -> str:
+        return f"{model.report['points']} are too few"
+
+    done = register(lambda *_: next(results), refuse, fallbacks=fallbacks)
     assert [a["registered"] for a in done.attempts] == ([0, 2, 1, 0, 2] if fallbacks else [0])
     assert done.refused == ("10 are too few" if fallbacks else "0 are too few")
 
@@ -124,7 +136,7 @@ def with_exif(photos: PhotoCollection, focal: float | None) -> PhotoCollection:
 
 
 def test_an_attempt_is_without_the_focal_length_of_exif(
-    photos: PhotoCollection, sfm_conf: SfmConf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    photos: PhotoCollection, register: Register
 ) -> None:
     given: list[list[sfm.SfmImage]] = []
 
@@ -132,14 +144,10 @@ def test_an_attempt_is_without_the_focal_length_of_exif(
         given.append(sfm_images)
         return registered(2 if sfm_images[0].focal is None else 1)
 
-    monkeypatch.setattr(sfm, "reconstruct", reconstruct)
-    done = sfm_retries.register(
-        with_exif(photos, 300.0),
-        [1],
-        sfm_conf,
-        tmp_path,
-        lambda model: "" if len(model.viewmats) == 2 else "too few",
-    )
+    def refuse(model: Reconstruction) -> str:
+        return "" if len(model.viewmats) == 2 else "too few"
+
+    done = register(reconstruct, refuse, with_exif(photos, 300.0))
     assert [a["attempt"] for a in done.attempts] == ["configured", "relaxed", "without_exif"]
     assert all(image.focal for images_of in given[:-1] for image in images_of)
     assert [image.focal for image in given[-1]] == [None, None]
@@ -152,13 +160,7 @@ def test_an_attempt_is_without_the_focal_length_of_exif(
     ("error", "views", "is_taken"), [(0.5, 2, True), (1.5, 2, False), (0.5, 1, False)]
 )
 def test_views_that_fit_another_camera_are_tried_with_one(
-    photos: PhotoCollection,
-    sfm_conf: SfmConf,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    error: float,
-    views: int,
-    is_taken: bool,
+    photos: PhotoCollection, register: Register, error: float, views: int, is_taken: bool
 ) -> None:
     given: list[list[sfm.SfmImage]] = []
 
@@ -169,9 +171,8 @@ def test_views_that_fit_another_camera_are_tried_with_one(
         apart = {1: 1} if len(given) == 1 else {}
         return replace(found, report=found.report | errors, apart=apart)
 
-    monkeypatch.setattr(sfm, "reconstruct", reconstruct)
     known = with_exif(photos, 28.0)
-    done = sfm_retries.register(known, [1], sfm_conf, tmp_path, lambda _: "")
+    done = register(reconstruct, given=known)
     assert [a["attempt"] for a in done.attempts] == ["configured", "cameras_apart"]
     first, second = given
     assert second[0] == first[0]
@@ -214,15 +215,14 @@ def test_small_images_are_upsampled_or_have_a_camera_of_their_own(
 
 
 def test_the_lens_of_an_image_for_sfm_is_mapped_to_the_hr_view(
-    photos: PhotoCollection, sfm_conf: SfmConf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    photos: PhotoCollection, register: Register
 ) -> None:
     """The right view is 741 x 500 px: 185 x 125 for SfM, and 504 x 340 cropped to 500 x 340."""
     hr = photos[1].hr
     assert (hr.resized, hr.width, hr.height) == ((504, 340), 500, 340)
     seen = Lens("SIMPLE_RADIAL", (185.0, 92.5, 62.5, 0.1), 185, 125)
     model = replace(registered(1), lenses={1: seen})
-    monkeypatch.setattr(sfm, "reconstruct", lambda *_: model)
-    done = sfm_retries.register(photos, [1], sfm_conf, tmp_path, lambda _: "")
+    done = register(lambda *_: model)
     made = done.model.lenses[1]
     assert (made.width, made.height, made.params) == (500, 340, seen.params)
     assert pytest.approx(np.array([[504, 0, 250], [0, 185 * 340 / 125, 170], [0, 0, 1]])) == made.K
@@ -252,17 +252,12 @@ def photograph(index: int) -> NDArray[np.uint8]:
 @pytest.fixture
 def wall(tmp_path: Path, configured: Callable[..., VariantConf]) -> PhotoCollection:
     """Four photographs of the wall, which EXIF turns by a quarter, and their poses."""
-    model, files, exif = pycolmap.Reconstruction(), {}, Image.Exif()
+    exif, files = Image.Exif(), {f"wall{i}": tmp_path / f"wall{i}.png" for i in range(4)}
     exif[0x112] = 6
-    CAMERA.camera_id = 1
-    model.add_camera_with_trivial_rig(CAMERA)
-    for i in range(4):
-        files[f"wall{i}"] = tmp_path / f"wall{i}.png"
-        Image.fromarray(photograph(i)).save(files[f"wall{i}"], exif=exif)
-        image = pycolmap.Image(name=f"wall{i}.png", camera_id=1, image_id=i + 1)
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(viewmat(i)[:3]))
-    (tmp_path / "poses").mkdir()
-    model.write_binary(tmp_path / "poses")
+    for i, file in enumerate(files.values()):
+        Image.fromarray(photograph(i)).save(file, exif=exif)
+    matrices = {file.name: viewmat(i) for i, file in enumerate(files.values())}
+    write_model(tmp_path / "poses", CAMERA, matrices, np.zeros((0, 3)))
     (tmp_path / "work").mkdir()
     return prepare_hr_views(Scene("x", "", files), configured(long_side=0), tmp_path / "work")
 

@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 
@@ -15,9 +15,6 @@ from xrgs.config import VariantConf
 from xrgs.mixture import degradations, tags, variant
 from xrgs.photos import scenes
 from xrgs.safeio import code
-
-if TYPE_CHECKING:
-    pass
 
 Make = Callable[..., VariantConf]
 SCENE = scene_conf("motorcycle", name="motorcycle")

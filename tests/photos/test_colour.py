@@ -17,7 +17,6 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 from PIL import Image, ImageCms
-from skimage import color
 
 from tests.photos.made_files import ADOBE_RGB, DISPLAY_P3, SRGB, cmyk_profile, png, profile
 from xrgs.photos import colour, images
@@ -211,6 +210,8 @@ def test_cmyk_is_converted_by_its_profile(tmp_path: Path, form: str) -> None:
 
 
 def test_lab_is_as_scikit_image_gives_it(tmp_path: Path) -> None:
+    from skimage import color
+
     grid = np.stack(np.meshgrid(range(120, 180, 10), range(-20, 21, 5), range(-20, 21, 5)), -1)
     stored = grid.reshape(1, -1, 3)
     tifffile.imwrite(
@@ -471,18 +472,3 @@ def test_cmyk_of_16_bits_is_as_its_8_bits(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "a.tif", samples.astype(np.uint16) * 257, photometric="separated")
     plain = np.asarray(Image.fromarray(samples, "CMYK").convert("RGB")) / 255
     assert np.abs(images.read(tmp_path / "a.tif") - plain).max() < 0.6 / 255
-
-
-@pytest.mark.parametrize("suffix", [".heic", ".avif"])
-def test_full_and_narrow_range_are_the_same_picture(tmp_path: Path, suffix: str) -> None:
-    """The two containers have YUV of either range, which their decoders read."""
-    pillow_heif.register_heif_opener()
-    flags: list[dict[str, Any]] = [{"full_range_flag": 1}, {"full_range_flag": 0}]
-    if suffix == ".avif":
-        flags = [{"range": "full", "subsampling": "4:4:4"}, {"range": "limited"}]
-    for i, flag in enumerate(flags):
-        more = {"chroma": 444} | flag if suffix == ".heic" else flag
-        picture = Image.fromarray(np.full((64, 64, 3), (235, 128, 16), np.uint8))
-        picture.save(tmp_path / f"{i}{suffix}", quality=100, **more)
-        pixels = images.decode(tmp_path / f"{i}{suffix}").pixels[32, 32] * 255
-        assert np.abs(pixels - (235, 128, 16)).max() <= 3

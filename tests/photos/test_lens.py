@@ -112,23 +112,6 @@ def test_undistortion_reads_each_pixel_where_the_lens_projects_its_ray(
     assert np.abs(out[..., :2] * (W, H) - expected)[inner].max() < 0.02
 
 
-@pytest.mark.parametrize("model", SERVED)
-def test_a_distorted_checkerboard_is_straight_again(model: str) -> None:
-    """The board is rendered through pycolmap's inverse, which undistortion does not use."""
-
-    def board(rays: NDArray[np.float64]) -> NDArray[np.float32]:
-        waves = np.sin(12 * rays[..., 0]) * np.sin(12 * rays[..., 1])
-        return np.repeat((0.5 + 0.4 * waves)[..., None], 3, -1).astype(np.float32)
-
-    cam = camera(model, f=80.0)
-    rays = cam.cam_from_img(pixel_grid().reshape(-1, 2)).reshape(H, W, 2)
-    lens = lens_of(cam)
-    K = lens.undistorted().K
-    expected = board(rays_of(pixel_grid(), K)[..., :2])
-    error = np.abs(undistort(board(rays), lens) - expected)[2:-2, 2:-2]
-    assert error.max() < 0.01
-
-
 @pytest.mark.parametrize("k", [-0.2, -0.02, 0.03, 0.15])
 def test_the_undistorted_image_is_zoomed_as_little_as_fills_it(k: float) -> None:
     flat = simple(k).undistorted()
@@ -150,20 +133,6 @@ def test_a_wide_fisheye_keeps_60_degrees_to_each_side() -> None:
     radius = np.arctan(np.tan(np.radians(60)) / np.cos(azimuth)) * 200 / np.pi
     area = 4 * np.trapezoid(radius**2, azimuth) / 2
     assert lens.kept() == pytest.approx(area / 200**2, rel=1e-4)
-
-
-@pytest.mark.parametrize("quarters", [1, 2, 3])
-def test_a_turned_camera_sees_what_the_turned_image_shows(quarters: int) -> None:
-    lens = lens_of_model("OPENCV", (W, H), [60, 50, 48, 41, 0.1, 0.02, 0.01, -0.02])
-    x, y = np.random.default_rng(0).uniform(-0.5, 0.5, (2, 50))
-    px, py = lens.project(np.stack([x, y], -1)).T
-    turned, rays = {1: ((H - py, px), (-y, x)), 2: ((W - px, H - py), (-x, -y))}.get(
-        quarters, ((py, W - px), (y, -x))
-    )
-    found = lens.turned(quarters)
-    assert found.project(np.stack(rays, -1)) == pytest.approx(np.stack(turned, -1))
-    assert (found.width, found.height) == ((W, H) if quarters == 2 else (H, W))
-    assert np.diag(found.K)[:2] == pytest.approx((60, 50) if quarters == 2 else (50, 60))
 
 
 def test_a_pinhole_photograph_is_returned_as_it_is() -> None:

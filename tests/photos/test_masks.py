@@ -16,8 +16,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from PIL import Image, ImageOps
 
-from tests.photos.scene_confs import scene_conf
-from xrgs.composing import compose
+from tests.photos.scene_confs import scene_conf, whole_sizes
 from xrgs.config import SfmConf
 from xrgs.errors import XrgsError
 from xrgs.mixture import sfm, sfm_retries
@@ -27,7 +26,6 @@ from xrgs.photos.lens import Lens
 from xrgs.photos.masks import Masks
 from xrgs.photos.scenes import Scene
 
-CONF = compose("variant.long_side=0", "variant.factor=2").variant
 Mask = NDArray[np.bool_]
 
 
@@ -173,7 +171,7 @@ def test_a_mask_that_may_be_a_photograph_is_said(tmp_path: Path) -> None:
         "a": save(tmp_path / "photo.png", noise((60, 40), 5)),
         "b": save(tmp_path / "blurred.png", GREY.resize((59, 39)).resize((60, 40))),
     }
-    photos = prepare_hr_views(Scene("x", "", files, masks=given_masks), CONF, tmp_path)
+    photos = prepare_hr_views(Scene("x", "", files, masks=given_masks), whole_sizes(), tmp_path)
     said = "masks that are not black and white, of which what is brighter than grey is used"
     assert photos.notes == (f"{said}: a.png",)
 
@@ -292,7 +290,7 @@ def prepared(
         masks=given_masks,
         alpha="mask" if alpha else "composite",
     )
-    conf = replace(CONF, **changes)
+    conf = replace(whole_sizes(), **changes)
     photos = prepare_hr_views(scene, conf, folder, for_sfm=True)
     write_degraded(photos, [0, 1], conf)
     write_degraded(photos, [0, 1], conf, "sfm_lr")
@@ -347,7 +345,7 @@ def test_a_mask_that_hides_nothing_changes_no_bit(tmp_path: Path) -> None:
 def test_a_photograph_whose_mask_is_black_is_left_out_by_name(tmp_path: Path) -> None:
     files = {name: save(tmp_path / f"{name}.png", noise((60, 40))) for name in "abc"}
     mask = save(tmp_path / "black.png", np.zeros((40, 60), np.uint8))
-    photos = prepare_hr_views(Scene("x", "", files, masks={"b": mask}), CONF, tmp_path)
+    photos = prepare_hr_views(Scene("x", "", files, masks={"b": mask}), whole_sizes(), tmp_path)
     assert photos.names == ["a", "c"]
     assert photos.notes == ("left out: b.png (its mask leaves no pixel)",)
 

@@ -30,7 +30,7 @@ import sys, time
 from pathlib import Path
 from xrgs.runtime import lease
 folder, log = Path(sys.argv[1]), Path(sys.argv[2])
-end = time.monotonic() + 1
+end = time.monotonic() + 0.5
 while time.monotonic() < end:
     held = lease.acquire(folder, "cell")
     if held is not None:
@@ -59,6 +59,13 @@ def owner(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
         process.kill()
 
 
+def take(folder: Path, name: str = "cell") -> lease.Lease:
+    """A lease that is free."""
+    held = lease.acquire(folder, name)
+    assert held is not None
+    return held
+
+
 def dated(file: Path, age: float) -> None:
     """Set a file's time to what it was `age` seconds ago; in the future where that is negative."""
     then = time.time() - age
@@ -73,14 +80,13 @@ def elsewhere(file: Path, age: float) -> None:
 
 
 def test_a_lease_has_one_owner_until_it_is_released(folder: Path) -> None:
-    held = lease.acquire(folder, "cell")
-    assert held is not None
+    held = take(folder)
     assert lease.acquire(folder, "cell") is None
-    assert lease.acquire(folder, "other") is not None
+    take(folder, "other")
     assert str(os.getpid()) in str(lease.holders(folder)["cell"])
     held.release()
     assert set(lease.holders(folder)) == lease.names(folder) == {"other"}
-    assert lease.acquire(folder, "cell") is not None
+    take(folder)
 
 
 def test_a_stopped_process_keeps_its_lease_and_a_killed_one_loses_it(
@@ -101,9 +107,7 @@ def test_a_stopped_process_keeps_its_lease_and_a_killed_one_loses_it(
 @pytest.fixture
 def taken(folder: Path) -> Path:
     """The file of the lease `cell`, which this process has taken."""
-    held = lease.acquire(folder, "cell")
-    assert held is not None
-    return held.path
+    return take(folder).path
 
 
 @pytest.mark.parametrize("age", [-60.0, lease.SILENT_S - 60])
@@ -188,8 +192,7 @@ def test_a_thread_gives_the_heartbeats_until_the_lease_is_released(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(lease, "BEAT_S", 0.01)
-    held = lease.acquire(folder, "cell")
-    assert held is not None
+    held = take(folder)
     for _ in range(2):
         os.utime(held.path, (0, 0))
         wait(lambda: held.path.stat().st_mtime > 0)
@@ -201,11 +204,9 @@ def test_a_thread_gives_the_heartbeats_until_the_lease_is_released(
 def test_a_lease_that_was_taken_over_is_lost_and_its_successor_s_is_not_touched(
     folder: Path,
 ) -> None:
-    lost = lease.acquire(folder, "cell")
-    assert lost is not None
+    lost = take(folder)
     elsewhere(lost.path, 2 * lease.SILENT_S)  # suspended for long, as another machine sees it
-    other = lease.acquire(folder, "cell")
-    assert other is not None
+    other = take(folder)
     before = other.path.read_bytes()
     assert not lost.beat()
     assert lost.lost
@@ -220,8 +221,7 @@ def test_a_lease_that_was_taken_over_is_lost_and_its_successor_s_is_not_touched(
 
 def test_a_heartbeat_notices_a_newer_generation(folder: Path) -> None:
     """A successor creates its own file first, and deletes the lost one only then."""
-    lost = lease.acquire(folder, "cell")
-    assert lost is not None
+    lost = take(folder)
     assert lost.beat()
     lease.sign(folder / "cell.1")
     assert lost.path.exists()
@@ -231,8 +231,7 @@ def test_a_heartbeat_notices_a_newer_generation(folder: Path) -> None:
 def test_a_heartbeat_into_a_store_out_of_reach_decides_nothing(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    held = lease.acquire(folder, "cell")
-    assert held is not None
+    held = take(folder)
 
     def stale(path: Path, *_: object) -> None:
         raise OSError(errno.ESTALE, os.strerror(errno.ESTALE), str(path))
@@ -246,8 +245,7 @@ def test_a_heartbeat_into_a_store_out_of_reach_decides_nothing(
 def test_a_heartbeat_creates_nothing_where_the_store_is_gone(tmp_path: Path) -> None:
     folder = tmp_path / "s" / "locks"
     folder.mkdir(parents=True)
-    held = lease.acquire(folder, "cell")
-    assert held is not None
+    held = take(folder)
     (tmp_path / "s").rename(tmp_path / "moved")
     assert not held.beat()
     held.release()
@@ -260,8 +258,7 @@ def test_a_heartbeat_creates_nothing_where_the_store_is_gone(tmp_path: Path) -> 
 def test_waiting_ends_when_the_owner_releases_its_lease(
     folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    first = lease.acquire(folder, "scene")
-    assert first is not None
+    first = take(folder, "scene")
     monkeypatch.setattr(time, "sleep", lambda _: first.release())
     with lease.waited_for(folder, "scene") as second:
         assert second.beat()
@@ -302,29 +299,22 @@ def test_a_lease_that_is_created_again_meanwhile_is_not_taken_for_the_dead_one(
 
     monkeypatch.setattr(lease, "_generations", generations)
     monkeypatch.setattr(lease, "_state", seen)
-    held = lease.acquire(folder, "cell")
-    assert held is not None
-    assert held.path.name == "cell.0"
+    assert take(folder).path.name == "cell.0"
     assert contender.exists()
 
 
-def test_a_process_id_that_is_reused_is_another_process(folder: Path) -> None:
-    held = lease.acquire(folder, "cell")
-    assert held is not None
-    file = held.path
-    owner = json.loads(file.read_text())
-    file.write_text(json.dumps(owner | {"started": owner["started"] - 10}))
+def test_a_process_id_that_is_reused_is_another_process(folder: Path, taken: Path) -> None:
+    owner = json.loads(taken.read_text())
+    taken.write_text(json.dumps(owner | {"started": owner["started"] - 10}))
     assert not lease.holders(folder)
-    assert lease.acquire(folder, "cell") is not None
+    take(folder)
 
 
 def test_a_lost_lease_leaves_its_successor_s_file_alone(folder: Path) -> None:
     """After a take-over and a release the first generation is free again, for a third owner."""
-    lost = lease.acquire(folder, "cell")
-    assert lost is not None
+    lost = take(folder)
     lost.path.unlink()
-    third = lease.acquire(folder, "cell")
-    assert third is not None
+    third = take(folder)
     assert third.path == lost.path
     elsewhere(third.path, 0)
     signature = third.path.read_text()

@@ -15,6 +15,7 @@ import psutil
 import pytest
 import torch
 
+from tests.runtime.programs import run_python
 from xrgs.runtime import machine
 from xrgs.runtime.machine import (
     gpus,
@@ -70,15 +71,19 @@ GROUPS = {
 }
 
 
+def write_groups(root: Path, own: str | None, groups: dict[str, str]) -> None:
+    files = {f"sys/fs/cgroup/{name}": text for name, text in groups.items()}
+    if own is not None:
+        files["proc/self/cgroup"] = own
+    for name, text in files.items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text(f"{text}\n")
+
+
 @pytest.mark.parametrize("case", GROUPS)
 def test_the_quota_is_the_least_of_the_control_groups(tmp_path: Path, case: str) -> None:
     own, files, quota = GROUPS[case]
-    if own is not None:
-        files = {f"sys/fs/cgroup/{name}": text for name, text in files.items()}
-        files["proc/self/cgroup"] = own
-    for name, text in files.items():
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_text(f"{text}\n")
+    write_groups(tmp_path, own, files)
     assert machine.cpu_quota(tmp_path) == quota
 
 
@@ -93,11 +98,7 @@ def test_the_quota_is_the_least_of_the_control_groups(tmp_path: Path, case: str)
 def test_the_memory_is_the_least_of_the_machine_and_its_control_groups(
     tmp_path: Path, own: str, files: dict[str, str], limit: int | None
 ) -> None:
-    for name, text in files.items():
-        (tmp_path / "sys/fs/cgroup" / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / "sys/fs/cgroup" / name).write_text(f"{text}\n")
-    (tmp_path / "proc/self").mkdir(parents=True)
-    (tmp_path / "proc/self/cgroup").write_text(own)
+    write_groups(tmp_path, own, files)
     assert machine.usable_memory(tmp_path) == (limit or psutil.virtual_memory().total)
 
 
@@ -213,14 +214,11 @@ cycle = Cycle()
 
 
 def test_nothing_is_collected_at_the_end_of_a_quick_process() -> None:
-    def output(script: str) -> str:
-        command = [sys.executable, "-c", script]
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout
-
-    assert output(_IN_A_CYCLE) == "collected"
+    assert run_python(_IN_A_CYCLE).stdout == "collected"
     quick = "from xrgs.runtime.machine import end_quickly; end_quickly()"
     at_exit = "import atexit; atexit.register(print, 'functions of atexit run')"
-    assert output(f"{quick}; {at_exit}{_IN_A_CYCLE}") == "functions of atexit run\n"
+    done = run_python(f"{quick}; {at_exit}{_IN_A_CYCLE}", check=True)
+    assert done.stdout == "functions of atexit run\n"
 
 
 def test_nothing_is_collected_in_a_block_without_collections() -> None:

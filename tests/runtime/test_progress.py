@@ -75,19 +75,6 @@ def test_progress_in_a_file_is_shown_nowhere_and_removed_at_the_end(
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "{",
-        '{"what": "a", "unit": "b", "done": "x", "total": 1, "rate": 1}',
-        '{"what": "a", "unit": "b", "done": 1, "total": 1, "rate": 1e300}',
-    ],
-)
-def test_an_invalid_file_is_no_progress(tmp_path: Path, text: str) -> None:
-    (tmp_path / "progress.json").write_text(text)
-    assert read(tmp_path / "progress.json") is None
-
-
 def test_the_text_has_all_that_is_known() -> None:
     assert str(Progress("training", "step", 1200, 3000, 31.04)) == (
         "training 1,200 of 3,000 steps, 31 steps/s, ~58 s left"

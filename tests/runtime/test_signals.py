@@ -8,6 +8,8 @@ import sys
 
 import pytest
 
+from tests.runtime.programs import run_python
+
 _SCRIPT = """
 import signal, sys, time
 from xrgs.runtime.signals import exit_on_signal
@@ -76,12 +78,7 @@ os.kill(os.getpid(), signal.{name})
         ("from xrgs.mixture import sfm", "SIGABRT", 0, "Fatal Py"),
         (f"from xrgs.photos.lens import Lens; {distorted}.kept()", "SIGTERM", 0, ""),
     ):
-        done = subprocess.run(
-            [sys.executable, "-P", "-c", script.format(imports=imports, name=name, thread=thread)],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
+        done = run_python(script.format(imports=imports, name=name, thread=thread))
         assert done.returncode == -getattr(signal, name)
         assert done.stderr.startswith(said)
         assert "***" not in done.stderr

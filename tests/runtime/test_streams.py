@@ -7,7 +7,6 @@ import os
 import pty
 import shutil
 import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
@@ -15,6 +14,7 @@ from pathlib import Path
 import pyte
 import pytest
 
+from tests.runtime.programs import run_python
 from xrgs.runtime.streams import redraw, say
 
 _SCRIPT = """
@@ -58,13 +58,9 @@ def _full_disk() -> Iterator[int]:
 def test_the_work_goes_on_without_a_reader(
     tmp_path: Path, gone: Callable[[], AbstractContextManager[int]], how: str
 ) -> None:
-    with gone() as descriptor:
-        done = subprocess.run(
-            [sys.executable, "-c", _SCRIPT, how],
-            cwd=tmp_path,
-            stdout=descriptor,
-            stderr=descriptor,
-            check=False,
+    with gone() as there:
+        done = run_python(
+            _SCRIPT, how, cwd=tmp_path, stdout=there, stderr=there, capture_output=False
         )
     assert (done.returncode == 0) == (how == "guard")
     assert (tmp_path / "done").exists() == (how == "guard")
@@ -89,15 +85,7 @@ with open("file", "w") as file:
         for descriptor in closed:
             os.close(descriptor)
 
-    done = subprocess.run(
-        [sys.executable, "-c", script],
-        cwd=tmp_path,
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        check=True,
-        preexec_fn=close,
-    )
+    done = run_python(script, cwd=tmp_path, check=True, stdin=subprocess.DEVNULL, preexec_fn=close)
     assert (tmp_path / "file").read_text() == "False ''"
     said = "text\nof a child\n"
     assert (done.stdout, done.stderr) == ("" if 1 in closed else said, "" if 2 in closed else said)
@@ -144,9 +132,7 @@ def test_a_message_of_a_log_is_one_line_and_a_traceback_keeps_its_lines() -> Non
         "except ValueError:\n"
         "    log.exception('failed')\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=True
-    )
+    done = run_python(script, check=True)
     first, second, *traceback = done.stderr.splitlines()
     assert first.endswith(" a 2026-01-01 forged [2J; left out")
     assert second.endswith(" failed")

@@ -10,15 +10,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from xrgs.evaluation.lpips import weights
 from xrgs.evaluation.lpips.weights import WeightsError
 from xrgs.safeio import npz
-from xrgs.training.checkpoint import Checkpoint, CheckpointError
 
-FAST = settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
 ARRAYS = {
     "a": np.arange(6.0).reshape(2, 3),
     "by columns": np.asfortranarray(np.arange(6).reshape(2, 3)),
@@ -109,19 +105,6 @@ def test_an_archive_that_declares_more_than_it_has_is_refused(content: bytes, wh
     with pytest.raises(ValueError, match=why):
         npz.read(io.BytesIO(content))
     assert not Path("trap").exists()
-
-
-@FAST
-@given(content=st.binary(max_size=200), zipped=st.booleans())
-def test_other_bytes_than_weights_or_a_checkpoint_are_refused_by_name(
-    tmp_path: Path, content: bytes, zipped: bool
-) -> None:
-    file = tmp_path / "w.npz"
-    file.write_bytes(b"PK\x03\x04" * zipped + content)
-    with pytest.raises(WeightsError, match=r"w\.npz"):
-        weights.load(file)
-    with pytest.raises(CheckpointError, match=r"w\.npz"):
-        Checkpoint(file).load()
 
 
 def test_a_file_too_large_for_weights_is_not_read(tmp_path: Path) -> None:

@@ -190,14 +190,6 @@ def test_damaged_text_is_named(tmp_path: Path, body: bytes, message: str) -> Non
         ply.read(file)
 
 
-@pytest.mark.parametrize("content", [b"", b"ply", b"plyx\n", b"ply\n" + b"x" * 10_000, b"PLY\n"])
-def test_no_header(tmp_path: Path, content: bytes) -> None:
-    file = tmp_path / "a.ply"
-    file.write_bytes(content)
-    with pytest.raises(XrgsError, match=re.escape(str(file))):
-        ply.read(file)
-
-
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
 def test_memory_is_bounded_by_the_file(tmp_path: Path, form: str) -> None:
     header = f"element a {10**11}\nproperty double a\nelement vertex {10**11}\nproperty double x"

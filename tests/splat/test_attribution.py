@@ -91,9 +91,3 @@ def test_native_attributes_as_torch_does() -> None:
     expected = attribute_pixels(pixels, gaussians, camera, settings).sums
     torch.testing.assert_close(native, expected, rtol=1e-3, atol=1e-3)
     assert expected.std() > 0.1
-
-
-def test_a_map_of_another_size_is_refused(in_a_row: Scene) -> None:
-    pixels, gaussians = torch.ones(20, 14).double(), ActivatedGaussians(**in_a_row)
-    with pytest.raises(ValueError, match=r"pixels must be \[14, 20\]"):
-        attribute_pixels(pixels, gaussians, make_camera(), RasterSettings())

@@ -10,8 +10,10 @@ from hypothesis import HealthCheck, Phase, example, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from tests.splat.scenes import Scene, draw, gradients_of, make_camera, make_scene, with_gradients
+from tests.splat.native.oracle import run
+from tests.splat.scenes import Scene, draw, make_camera, make_scene
 from xrgs.splat.cameras import Camera
+from xrgs.splat.gaussians import PARAMETERS
 from xrgs.splat.settings import RasterSettings
 
 #: The exponents of the smallest denormal and of the largest number of float32.
@@ -28,11 +30,9 @@ CAMERA = Camera(CAMERA.viewmat.float().double(), CAMERA.K.float().double(), 20, 
 
 def rendered(scene: Scene, backend: str, raster: RasterSettings) -> tuple[Tensor, Scene]:
     """The image, and the gradients of a loss that weighs every pixel differently."""
-    leaves = with_gradients(scene)
-    image = draw(leaves, CAMERA, raster, backend=backend).image
-    weights = torch.linspace(-1, 1, image.numel(), dtype=image.dtype).reshape(image.shape)
-    torch.autograd.backward((image * weights).sum())
-    return image.detach(), gradients_of(leaves)
+    weights = torch.linspace(-1, 1, 14 * 20 * 3).reshape(14, 20, 3), torch.zeros(14, 20)
+    render, gradients = run(scene, CAMERA, raster, backend, scene["means"].dtype, weights)
+    return render.image.detach(), {name: gradients[name] for name in PARAMETERS}
 
 
 def check(scene: Scene, backend: str, raster: RasterSettings) -> None:

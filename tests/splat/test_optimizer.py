@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from math import inf, nan
-from typing import Any
+from math import nan
 
 import pytest
 import torch
@@ -223,39 +222,6 @@ def test_schedules_without_meaning_are_refused(name: str, value: float) -> None:
     setattr(settings, name, value)
     with pytest.raises(ValueError, match=name):
         optimizer_of(settings=settings)
-
-
-@pytest.mark.parametrize(
-    ("name", "value"), [("steps", 0), *(("scene_scale", v) for v in (0.0, nan, inf))]
-)
-def test_a_run_without_meaning_is_refused(name: str, value: float) -> None:
-    changed: dict[str, Any] = {name: value}
-    with pytest.raises(ValueError, match=name):
-        make_optimizer(normal_parameters(2, 0), **changed)
-
-
-def test_training_goes_on_after_a_change() -> None:
-    optimizer = optimizer_of(5)
-    step_of(optimizer, 1)
-    optimizer.append(normal_parameters(2, 3, dtype=torch.float64))
-    optimizer.keep(torch.tensor([6, 1]))
-    first = optimizer.gaussians.scales.detach().clone()
-    gradients = step_of(optimizer, 4)
-    # A new Gaussian's first update, by hand, at the old ones' second step.
-    g = gradients["scales"][0]
-    mean, square = 0.1 * g / (1 - 0.9**2), 0.001 * g**2 / (1 - 0.999**2)
-    expected = first[0] - 5e-3 * mean / (square.sqrt() + 1e-15)
-    torch.testing.assert_close(optimizer.gaussians.scales.detach()[0], expected)
-
-
-def test_changes_before_the_first_step() -> None:
-    optimizer = optimizer_of(5)
-    optimizer.keep(torch.tensor([1, 2]))
-    optimizer.append(normal_parameters(1, 1, dtype=torch.float64))
-    optimizer.reset("opacities", torch.zeros(3, dtype=torch.float64))
-    assert optimizer.state_bytes() == 0
-    step_of(optimizer, 2)
-    assert optimizer.adam["means"]["exp_avg"].shape == (3, 3)
 
 
 def test_no_gaussians_left(backend: str) -> None:

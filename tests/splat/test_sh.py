@@ -7,7 +7,7 @@ from gsplat.cuda._torch_impl import _spherical_harmonics
 from scipy.special import sph_harm_y
 from torch import Tensor
 
-from xrgs.splat.sh import colors_to_sh0, sh_basis, sh_to_colors
+from xrgs.splat.sh import sh_basis, sh_to_colors
 
 
 @pytest.fixture
@@ -41,14 +41,6 @@ def test_colors_are_gsplats(dirs: Tensor, degree: int) -> None:
     # gsplat's constants are written to 13 digits.
     torch.testing.assert_close(ours, expected, atol=1e-11, rtol=0)
     assert (ours == 0).any(), "the clamp must have been tried"
-
-
-def test_colors_to_sh0_shows_the_color_from_everywhere(dirs: Tensor) -> None:
-    colors = torch.rand(len(dirs), 3, dtype=torch.float64)
-    shown = sh_to_colors(
-        0, dirs, colors_to_sh0(colors), torch.zeros(len(dirs), 0, 3, dtype=torch.float64)
-    )
-    torch.testing.assert_close(shown, colors)
 
 
 def test_gradient(dirs: Tensor) -> None:

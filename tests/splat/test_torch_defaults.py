@@ -3,40 +3,43 @@
 from __future__ import annotations
 
 import shutil
-import subprocess
-import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import torch
 
-#: `meta` stands for any device: an operation on it and on the CPU's memory raises.
-PROGRAM = """
-import sys, torch, xrgs
-folder = sys.argv[1]
-conf = xrgs.compose("scene=motorcycle", "preset=smoke", "train.steps=2", f"store={folder}/s")
-torch.set_default_dtype(torch.float64)
-torch.set_default_device("meta")
-data = xrgs.build_dataset(conf)
-gaussians = xrgs.train(data, conf).gaussians
-image = xrgs.rasterize(gaussians, data.train[0].camera).image
-assert (image.dtype, image.device.type) == (torch.float32, "cpu")
-for suffix in (".ply", ".glb", ".spz"):
-    xrgs.save_gaussians(f"{folder}/a{suffix}", gaussians)
-    means = xrgs.load_gaussians(f"{folder}/a{suffix}").gaussians.means
-    assert (means.dtype, means.device.type) == (torch.float32, "cpu")
-try:
-    xrgs.rasterize(gaussians, data.train[0].camera, sh_degree=9)
-    raise SystemExit("sh_degree=9 is accepted")
-except ValueError:
-    pass  # and the program's own defaults are restored
-assert torch.get_default_dtype() == torch.float64
-assert torch.get_default_device().type == "meta"
-"""
+import xrgs
+from tests.conftest import composed
+
+
+@pytest.fixture
+def other_defaults() -> Iterator[None]:
+    """`meta` stands for any device: an operation on it and on the CPU's memory raises."""
+    torch.set_default_dtype(torch.float64)
+    torch.set_default_device("meta")
+    yield
+    torch.set_default_device(None)
+    torch.set_default_dtype(torch.float32)
 
 
 @pytest.mark.slow
-def test_the_public_functions_work(tmp_path: Path, smoke_variants: Path) -> None:
+def test_the_public_functions_work(
+    tmp_path: Path, smoke_variants: Path, other_defaults: None
+) -> None:
     shutil.copytree(smoke_variants, tmp_path / "s" / "variants")
-    run = [sys.executable, "-P", "-c", PROGRAM, str(tmp_path)]
-    done = subprocess.run(run, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    store = f"store={tmp_path}/s"
+    conf = composed("scene=motorcycle", "preset=smoke", "train.steps=2", store)
+    data = xrgs.build_dataset(conf)
+    gaussians = xrgs.train(data, conf).gaussians
+    image = xrgs.rasterize(gaussians, data.train[0].camera).image
+    assert (image.dtype, image.device.type) == (torch.float32, "cpu")
+    for suffix in (".ply", ".glb", ".spz"):
+        xrgs.save_gaussians(tmp_path / f"a{suffix}", gaussians)
+        means = xrgs.load_gaussians(tmp_path / f"a{suffix}").gaussians.means
+        assert (means.dtype, means.device.type) == (torch.float32, "cpu")
+    with pytest.raises(ValueError, match="sh_degree"):
+        xrgs.rasterize(gaussians, data.train[0].camera, sh_degree=9)
+    # The program's own defaults are restored, after an error too.
+    assert torch.get_default_dtype() == torch.float64
+    assert torch.get_default_device().type == "meta"

@@ -114,16 +114,6 @@ def test_it_is_written_once_in_an_interval(tmp_path: Path, monkeypatch: pytest.M
     assert Checkpoint(file, "cell").load() is None
 
 
-@settings(max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(share=st.floats(0, 1, exclude_max=True))
-def test_a_truncated_file_is_named(tmp_path: Path, share: float) -> None:
-    file = write(tmp_path / "c.npz", holder={"a": torch.arange(99.0)})
-    content = file.read_bytes()
-    file.write_bytes(content[: int(share * len(content))])
-    with pytest.raises(CheckpointError, match=r"c\.npz"):
-        Checkpoint(file, "cell").load()
-
-
 def test_a_flipped_bit_another_cell_and_a_missing_state_are_refused(tmp_path: Path) -> None:
     file = write(tmp_path / "c.npz", first={"a": torch.full((64,), 1.5)})
     with pytest.raises(CheckpointError, match=r"c\.npz: belongs to cell cell, not to other"):

@@ -16,7 +16,6 @@ The training is that of `hashed_training.py`, in a process of its own. What is n
 
 from __future__ import annotations
 
-import itertools
 import os
 import subprocess
 import sys
@@ -47,23 +46,28 @@ OLD_PROCESSOR = {
     "ONEDNN_MAX_CPU_ISA": "SSE41",
     "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2,-FMA,-AVX512F",
 }
+LIBRARIES = [{"MKL_CBWR": "COMPATIBLE"} | OLD_PROCESSOR, {}, {"MKL_CBWR": "AVX2"} | OLD_PROCESSOR]
+PLACES = max(len(WIDE), len(CAPABILITIES)) if WIDE else 1
 #: Each instruction set of ours with one of torch's, and the other way round: all pairs would say no
-#: more. The libraries' code paths take turns likewise.
+#: more. The libraries' code paths and the numbers of threads take turns likewise.
 PROCESSORS = [
-    (WIDE[place % len(WIDE)], CAPABILITIES[place % len(CAPABILITIES)], libraries)
-    for place, libraries in zip(
-        range(max(len(WIDE), len(CAPABILITIES))),
-        itertools.cycle(
-            [{"MKL_CBWR": "COMPATIBLE"} | OLD_PROCESSOR, {}, {"MKL_CBWR": "AVX2"} | OLD_PROCESSOR]
-        ),
-        strict=False,
+    (
+        {
+            "XRGS_ISA": WIDE[place % len(WIDE)] if WIDE else "portable",
+            "ATEN_CPU_CAPABILITY": CAPABILITIES[place % len(CAPABILITIES)],
+            **LIBRARIES[place % len(LIBRARIES)],
+        },
+        [number for number in (1, 2, 3) if (number - 1) % PLACES == place],
     )
-    if WIDE
+    for place in range(PLACES)
 ]
 
 
-def hashes(*threads: int, **environment: str) -> list[tuple[str, str]]:
-    """The strategy and the hash of each training, by strategy and then by number of threads."""
+@pytest.mark.slow
+@pytest.mark.parametrize(("environment", "threads"), PROCESSORS)
+def test_no_processor_and_no_number_of_threads_changes_a_bit(
+    environment: dict[str, str], threads: list[int]
+) -> None:
     done = subprocess.run(
         [sys.executable, "-P", str(PROGRAM), *map(str, threads)],
         env=os.environ | {"OMP_WAIT_POLICY": "passive"} | environment,
@@ -73,23 +77,7 @@ def hashes(*threads: int, **environment: str) -> list[tuple[str, str]]:
     )
     assert done.returncode == 0, done.stderr
     lines = [line.split() for line in done.stdout.splitlines()]
-    return [(strategy, found) for strategy, found in lines]
-
-
-@pytest.mark.slow
-def test_the_number_of_threads_changes_no_bit_and_they_are_the_held_ones() -> None:
-    found = hashes(2, 3)  # the test below has one
-    assert [strategy for strategy, _ in found] == [name for name in HELD for _ in range(2)]
-    assert len(set(found)) == len(HELD)
+    assert [strategy for strategy, _ in lines] == [name for name in HELD for _ in threads]
+    assert len({found for _, found in lines}) == len(HELD)
     if native.fused_multiply_add():
-        assert dict(found) == HELD, UPDATE
-
-
-@pytest.mark.skipif(
-    not native.fused_multiply_add(), reason="this machine has no fused multiply-add"
-)
-@pytest.mark.slow
-@pytest.mark.parametrize(("isa", "capability", "libraries"), PROCESSORS)
-def test_no_processor_changes_a_bit(isa: str, capability: str, libraries: dict[str, str]) -> None:
-    found = hashes(1, XRGS_ISA=isa, ATEN_CPU_CAPABILITY=capability, **libraries)
-    assert found == list(HELD.items()), UPDATE
+        assert dict(lines) == HELD, UPDATE

@@ -7,7 +7,6 @@ GPU's rules for the GPU (`tests/fake_gpu.py`).
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -15,13 +14,10 @@ import torch
 from tests.conftest import composed as compose
 from tests.fake_gpu import DEVICE, fake_gpu
 from tests.gsplat_stand_in import ALPHA_MAX, stand_in
-from tests.training.conftest import comparable, masked
+from tests.training.conftest import Losses, killed_and_not, masked
 from xrgs.config import Conf
 from xrgs.evaluation import protocol
 from xrgs.splat.gaussians import PARAMETERS
-from xrgs.splat.loss import photometric_loss
-from xrgs.training import loop
-from xrgs.training.checkpoint import Checkpoint
 from xrgs.training.components import Step
 from xrgs.training.dataset import Dataset
 from xrgs.training.loop import train
@@ -89,35 +85,12 @@ def test_training_leaves_no_tensor_on_the_processor(data: Dataset, training: str
     assert all(torch.isfinite(result.gaussians[name]).all() for name in PARAMETERS)
 
 
-class Kill(BaseException):
-    """Ends a run as a kill does."""
-
-
 @pytest.mark.slow
-def test_a_killed_run_continues(
-    data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    conf, calls = config("mip", "train.steps=8", "splat.densify.every=7500"), [0]
+def test_a_killed_run_continues(data: Dataset, losses: Losses, tmp_path: Path) -> None:
+    conf = config("mip", "train.steps=8", "splat.densify.every=7500")
     conf.components.exposure.mode = "affine"
-
-    def mortal(*arguments: Any, **named: Any) -> Any:
-        calls[0] += 1
-        if calls[0] == 13:
-            raise Kill
-        return photometric_loss(*arguments, **named)
-
-    def checkpoint() -> Checkpoint:
-        return Checkpoint(tmp_path / "checkpoint.npz", "cell", every_s=1e-9)
-
-    monkeypatch.setattr(loop, "photometric_loss", mortal)
     with stand_in(DEVICE.type), fake_gpu():
-        whole = train(data, conf)
-        with pytest.raises(Kill):
-            train(data, conf, checkpoint())
-        continued = checkpoint()
-        assert continued.load() == 4
-        again = train(data, conf, continued)
-    assert comparable(again) == comparable(whole)
+        killed_and_not(data, conf, losses, tmp_path)
 
 
 @pytest.mark.slow

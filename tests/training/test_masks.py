@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +16,11 @@ from torch import Tensor
 from tests.conftest import composed as compose
 from tests.splat.scenes import noise
 from tests.training.components.conftest import make_view
+from tests.training.components.test_mip import CLOSE, FAR
 from tests.training.conftest import comparable
 from xrgs.evaluation import protocol
 from xrgs.mixture.views import Variant, View
 from xrgs.photos import images
-from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import Gaussians
 from xrgs.splat.loss import photometric_loss, prepare_target
 from xrgs.splat.rendering import attribute_pixels, rasterize_parameters
@@ -31,18 +29,12 @@ from xrgs.store.trimming import texture
 from xrgs.training import dataset
 from xrgs.training.components.mip import sampling_rates
 from xrgs.training.components.weighting import _box_mean, mean_gradient, region_attenuations
-from xrgs.training.dataset import Dataset, LoadedView
+from xrgs.training.dataset import Dataset
 from xrgs.training.loop import train
 from xrgs.training.rendering import inside_mask
 from xrgs.training.seeding import seeded_generator
 
 SIZES = {"HR": (36, 28), "LR": (18, 14)}
-BACKENDS = [
-    "torch",
-    pytest.param(
-        "native", marks=pytest.mark.skipif(find_spec("xrgs._native") is None, reason="no kernels")
-    ),
-]
 
 
 def left_half(view_size: tuple[int, int]) -> NDArray[np.bool_]:
@@ -101,7 +93,6 @@ COMPONENTS = (
 
 @pytest.mark.slow
 @pytest.mark.parametrize("components", [(), COMPONENTS], ids=["baseline", "components"])
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_hidden_pixels_change_no_bit_of_training_and_no_score(
     tmp_path: Path, backend: str, components: tuple[str, ...]
 ) -> None:
@@ -125,7 +116,6 @@ def test_hidden_pixels_change_no_bit_of_training_and_no_score(
 # loss and statistics
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_a_mask_takes_the_loss_outside_and_changes_no_gradient_far_inside(backend: str) -> None:
     photograph, mask = noise(48, 60).float(), torch.from_numpy(left_half((60, 48)))
     gradients, losses = [], []
@@ -151,7 +141,6 @@ def test_a_mask_takes_the_loss_outside_and_changes_no_gradient_far_inside(backen
 
 
 @pytest.mark.parametrize("absgrad", ["false", "true"])
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_a_view_counts_for_the_gaussians_that_it_shows_inside_its_mask(
     data: Dataset, monkeypatch: pytest.MonkeyPatch, backend: str, absgrad: str
 ) -> None:
@@ -225,41 +214,21 @@ def test_the_mean_of_a_window_is_over_its_used_pixels() -> None:
                 assert means[row, column].item() == pytest.approx(expected.item(), rel=1e-5)
 
 
-def test_the_attenuation_of_a_view_has_the_mean_of_its_used_pixels(
-    views: Mapping[str, LoadedView],
-) -> None:
+def test_the_attenuation_of_a_view_has_the_mean_of_its_used_pixels() -> None:
+    high, low = make_view("HR", noise(60, 75).float()), make_view("LR", noise(12, 15, 1).float())
     mask = torch.from_numpy(left_half((15, 12)))
-    low = replace(views["LR"], mask=mask)
     points = torch.rand(50, 3, generator=torch.Generator().manual_seed(2)) - 0.5
     points[:, 2] += 2
-    given_views = [views["HR"], low]
+    given_views = [high, replace(low, mask=mask)]
     (region,) = region_attenuations(given_views, points, texture=5.0, near=0.01).values()
     assert 0 < region[mask].mean() < 1
     assert region.mean().item() == pytest.approx(region[mask].mean().item(), rel=1e-6)
 
 
-@pytest.fixture
-def views() -> dict[str, LoadedView]:
-    """A view of each tag by its tag; the LR view is 5 times smaller."""
-    both = (make_view("HR", noise(60, 75).float()), make_view("LR", noise(12, 15, 1).float()))
-    return {view.tag: view for view in both}
-
-
 def test_a_masked_pixel_sets_no_sampling_rate() -> None:
-    far, close = (
-        Camera(
-            torch.tensor(
-                [[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, depth], [0, 0, 0, 1]], dtype=torch.float32
-            ),
-            torch.tensor([[focal, 0, 20.0], [0, focal, 20], [0, 0, 1]]),
-            40,
-            40,
-        )
-        for focal, depth in ((100.0, 4.0), (20.0, 1.0))
-    )
     mask = torch.ones(40, 40, dtype=torch.bool)
-    mask[:, 25:] = False  # 0.2 and more to the right of the axis of `far`
+    mask[:, 25:] = False  # 0.2 and more to the right of the axis of `FAR`
     means = torch.tensor([[0.0, 0.0, 0.0], [0.19, 0.3, 0.0], [0.21, 0.3, 0.0], [0.85, 0.0, 0.0]])
-    rates = sampling_rates(means, [far, close], 0.01, [mask, None])
+    rates = sampling_rates(means, [FAR, CLOSE], 0.01, [mask, None])
     assert rates.tolist() == [25.0, 25.0, 20.0, 20.0]
-    assert sampling_rates(means, [far], 0.01, [~mask]).tolist() == [0.0, 0.0, 25.0, 25.0]
+    assert sampling_rates(means, [FAR], 0.01, [~mask]).tolist() == [0.0, 0.0, 25.0, 25.0]

@@ -85,18 +85,6 @@ def test_steps_alike_are_counted_once_until_the_gaussians_change(data: Dataset) 
     assert count(12, 0, 300) == 1200
 
 
-def test_a_step_without_backward_does_not_stand_for_its_kind(data: Dataset) -> None:
-    held: list[torch.Tensor] = []
-    counted = TrainingMemory(held)
-    with counted.of_forward(step(data), 1, 0):
-        pass  # and no `record`
-    held.append(torch.zeros(100))
-    with counted.of_forward(step(data), 1, 0):
-        pass
-    counted.record(render(0))
-    assert counted.largest_bytes == 400
-
-
 def test_values_are_kept_as_far_as_the_bytes_go(
     data: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:

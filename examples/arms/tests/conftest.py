@@ -9,12 +9,14 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import baseline, compose, composed, data
+from tests.splat.conftest import backend
 from tests.training.components.conftest import build, hr, lr, off, shown, steps, views
 from tests.training.conftest import short
 from xrgs.config import Conf
 
 __all__ = [
-    "baseline", "build", "compose", "data", "hr", "lr", "off", "short", "shown", "steps", "views",
+    "backend", "baseline", "build", "compose", "data", "hr", "lr", "off", "short", "shown", "steps",
+    "views",
 ]  # fmt: skip
 
 ARMS = Path(__file__).parents[1]

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
 import torch
 
 from examples.arms.tests.conftest import with_arms
 from tests.training.conftest import comparable
-from tests.training.test_masks import BACKENDS, frozen
+from tests.training.test_masks import frozen
 from xrgs.training import dataset
 from xrgs.training.loop import train
 from xrgs_arms.view_scores import _in_unit_range
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_hidden_pixels_change_no_bit_of_training(tmp_path: Path, backend: str) -> None:
     conf = with_arms(
         f"splat.backend={backend}",

@@ -18,18 +18,24 @@ from xrgs.evaluation.lpips import download, weights
 from xrgs.evaluation.lpips.weights import Weights
 
 
+def published_tree(arrays: Weights, name: str, count: int) -> dict[str, Any]:
+    """What a published checkpoint holds of a network with so many convolutions."""
+    tree: dict[str, Any] = {name: {}}
+    for i in range(count):
+        kernel = np.ascontiguousarray(arrays[f"conv{i}.weight"].transpose(2, 3, 1, 0))
+        tree[name][f"Conv_{i}"] = {"kernel": kernel, "bias": arrays[f"conv{i}.bias"]}
+    for i in range(5):
+        head = arrays[f"head{i}"].reshape(1, 1, -1, 1)
+        tree[f"NetLinLayer_{i}"] = {"Conv_0": {"kernel": head}}
+    return tree
+
+
 @pytest.fixture
 def checkpoint(random_weights: Weights, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> bytes:
     """An `alexnet.ckpt` that is accepted as the published one, and an empty cache."""
     # As large as several blocks of the archive, of which one can be damaged.
-    tree: dict[str, Any] = {"AlexNet_0": {}, "padding": np.random.default_rng(0).bytes(300_000)}
-    for i in range(5):
-        kernel = np.ascontiguousarray(random_weights[f"conv{i}.weight"].transpose(2, 3, 1, 0))
-        bias = random_weights[f"conv{i}.bias"]
-        tree["AlexNet_0"][f"Conv_{i}"] = {"kernel": kernel, "bias": bias}
-        head = random_weights[f"head{i}"].reshape(1, 1, -1, 1)
-        tree[f"NetLinLayer_{i}"] = {"Conv_0": {"kernel": head}}
-    content = pickle.dumps(tree)
+    padding = {"padding": np.random.default_rng(0).bytes(300_000)}
+    content = pickle.dumps(published_tree(random_weights, "AlexNet_0", 5) | padding)
     sha256 = hashlib.sha256(content).hexdigest()
     monkeypatch.setitem(weights.CHECKPOINT_SHA256, weights.ALEX, sha256)
     monkeypatch.setattr(weights, "CONTENT_SHA256", weights.content_digest(random_weights))

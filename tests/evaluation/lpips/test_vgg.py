@@ -7,14 +7,13 @@ import pickle
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from tests.evaluation.lpips.test_download import sdist
+from tests.evaluation.lpips.test_download import published_tree, sdist
 from tests.evaluation.lpips.test_network import astronaut, blocks, by_definition, pair, tensors
 from xrgs.evaluation import metrics
 from xrgs.evaluation.lpips import download, weights
@@ -58,18 +57,7 @@ def few_channels() -> Weights:
 @pytest.fixture
 def checkpoint(few_channels: Weights, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> bytes:
     """A `vgg16.ckpt` that is accepted as the published one, and an empty cache."""
-    convolutions = {
-        f"Conv_{i}": {
-            "kernel": np.ascontiguousarray(few_channels[f"conv{i}.weight"].transpose(2, 3, 1, 0)),
-            "bias": few_channels[f"conv{i}.bias"],
-        }
-        for i in range(13)
-    }
-    tree: dict[str, Any] = {"VGG16_0": convolutions}
-    for i in range(5):
-        head = few_channels[f"head{i}"].reshape(1, 1, -1, 1)
-        tree[f"NetLinLayer_{i}"] = {"Conv_0": {"kernel": head}}
-    content = pickle.dumps(tree)
+    content = pickle.dumps(published_tree(few_channels, "VGG16_0", 13))
     monkeypatch.setitem(weights.CHECKPOINT_SHA256, VGG, hashlib.sha256(content).hexdigest())
     monkeypatch.setenv("XRGS_CACHE", str(tmp_path / "cache"))
     weights._load_cached.cache_clear()

@@ -190,11 +190,10 @@ def test_a_line_that_is_wrong_is_named(
 
 
 @pytest.mark.parametrize("file", ["cameras.bin", "images.bin", "points3D.bin"])
-@pytest.mark.parametrize("share", [0.0, 0.5, 0.999])
-def test_a_file_that_was_cut_is_named(tmp_path: Path, file: str, share: float) -> None:
+def test_a_file_that_was_cut_is_named(tmp_path: Path, file: str) -> None:
     folder = with_features(tmp_path)
     content = (folder / file).read_bytes()
-    (folder / file).write_bytes(content[: int(share * len(content))])
+    (folder / file).write_bytes(content[:-1])
     with pytest.raises(XrgsError, match=rf"/{file}: it ends after .* it was cut"):
         colmap.read(folder)
 

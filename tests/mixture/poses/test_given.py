@@ -48,14 +48,6 @@ def test_a_camera_that_can_not_be_is_refused_by_name(
         poses.read_poses(str(file), photos)
 
 
-def test_a_camera_of_colmap_that_can_not_be_is_refused_by_name(
-    photos: PhotoCollection, tmp_path: Path
-) -> None:
-    folder = write_colmap(tmp_path / "a", params=(9.0, 9.0, 102.0, 76.0))
-    with pytest.raises(XrgsError, match=r"the camera of a, for 204x152 px, has a focal length of"):
-        poses.read_poses(str(folder), photos)
-
-
 @pytest.mark.parametrize("row", [None, [0, 0, 1, 1], [0, 0, 0, 1.001]])
 def test_a_last_row_of_a_projection_is_refused(
     photos: PhotoCollection, tmp_path: Path, row: list[float] | None

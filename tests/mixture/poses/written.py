@@ -42,6 +42,28 @@ def project(index: int) -> NDArray[np.float64]:
     return camera[:, :2] / camera[:, 2:] * (fx, fy) + (cx, cy)
 
 
+def write_model(
+    folder: Path,
+    camera: pycolmap.Camera,
+    matrices: Mapping[str, NDArray[np.float64]],
+    points: NDArray[np.float64] = POINTS,
+    *,
+    text: bool = False,
+) -> Path:
+    """Write a model of COLMAP of one camera: its viewmat [4, 4] in each image, and points."""
+    rec = pycolmap.Reconstruction()
+    camera.camera_id = 1
+    rec.add_camera_with_trivial_rig(camera)
+    for i, (name, matrix) in enumerate(matrices.items()):
+        image = pycolmap.Image(name=name, camera_id=1, image_id=i + 1)
+        rec.add_image_with_trivial_frame(image, pycolmap.Rigid3d(matrix[:3]))
+    for point in points:
+        rec.add_point3D(point, pycolmap.Track(), np.array([10, 20, 30], np.uint8))
+    folder.mkdir(parents=True)
+    (rec.write_text if text else rec.write_binary)(folder)
+    return folder
+
+
 def write_colmap(
     folder: Path,
     model: str = "PINHOLE",
@@ -51,17 +73,9 @@ def write_colmap(
     size: tuple[int, int] = SIZE,
     text: bool = False,
 ) -> Path:
-    rec = pycolmap.Reconstruction()
-    camera = pycolmap.Camera(camera_id=1, model=model, width=size[0], height=size[1], params=params)
-    rec.add_camera_with_trivial_rig(camera)
-    for i, name in enumerate(names):
-        image = pycolmap.Image(name=name, camera_id=1, image_id=i + 1)
-        rec.add_image_with_trivial_frame(image, pycolmap.Rigid3d(viewmat(i)[:3]))
-    for point in POINTS:
-        rec.add_point3D(point, pycolmap.Track(), np.array([10, 20, 30], np.uint8))
-    folder.mkdir(parents=True)
-    (rec.write_text if text else rec.write_binary)(folder)
-    return folder
+    camera = pycolmap.Camera(model=model, width=size[0], height=size[1], params=params)
+    matrices = {name: viewmat(i) for i, name in enumerate(names)}
+    return write_model(folder, camera, matrices, text=text)
 
 
 def write_transforms(

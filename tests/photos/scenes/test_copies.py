@@ -283,18 +283,6 @@ def test_links_to_folders_elsewhere_are_named(tmp_path: Path) -> None:
     )
 
 
-def test_copies_of_the_sizes_that_are_not_taken_are_left_out(tmp_path: Path) -> None:
-    shoot(tmp_path / "images")
-    shoot(tmp_path / "images_2", size=(80, 60))
-    for number in range(6):
-        backup = tmp_path / "backup" / f"photo {number}.jpg"
-        backup.parent.mkdir(exist_ok=True)
-        shutil.copy(tmp_path / "images" / f"IMG_{number}.jpg", backup)
-    found = below(tmp_path, 80)
-    assert {file.parent.name for file in found.files.values()} == {"images_2"}
-    assert "backup/photo 0.jpg (of images/IMG_0.jpg)" in found.notes[1]
-
-
 def test_photographs_with_films_behind_them_are_whole(tmp_path: Path) -> None:
     for file in shoot(tmp_path / "images").iterdir():
         file.write_bytes(file.read_bytes() + bytes(5000))

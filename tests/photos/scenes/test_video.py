@@ -240,17 +240,6 @@ def test_a_disc_of_oblong_pixels_is_shown_round(
         assert across @ position**2 / across.sum() == pytest.approx(24**2 / 4, rel=0.03)
 
 
-def test_frames_that_are_too_large_once_pixels_are_square_are_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(images, "MAX_PIXELS", WIDTH * HEIGHT)
-    write_video(tmp_path / "a.mp4", [textured(90, 0)] * 2)
-    scenes.resolve(conf(tmp_path / "a.mp4", 2), tmp_path / "square")
-    write_video(tmp_path / "b.mp4", [textured(90, 0)] * 2, aspect=Fraction(2))
-    with pytest.raises(ImageError, match=r"b\.mp4: its frames have 192 x 64 pixels, too many"):
-        scenes.resolve(conf(tmp_path / "b.mp4", 2), tmp_path)
-
-
 def test_too_few_frames_no_video_and_no_package_are_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -302,22 +291,6 @@ def test_a_file_that_cannot_be_a_video_is_named_before_frames_are_taken(
     with pytest.raises(XrgsError) as read:
         video.extract(file, ["frame_0000", "frame_0001"], tmp_path)
     assert str(read.value) == str(refused.value)
-
-
-def test_names_are_of_the_first_frames_and_not_of_all(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write_video(tmp_path / "a.mp4", [textured(10 * i, 0) for i in range(20)])
-    decoded: list[int] = []
-    square = video._square
-
-    def counted(width: int, height: int, aspect: Fraction) -> tuple[int, int]:
-        decoded.append(width)
-        return square(width, height, aspect)
-
-    monkeypatch.setattr(video, "_square", counted)
-    assert scenes.names(conf(tmp_path / "a.mp4", 3)) == ["frame_0000", "frame_0001", "frame_0002"]
-    assert decoded == [WIDTH]
 
 
 def test_a_truncated_video_gives_the_frames_that_it_has(tmp_path: Path) -> None:

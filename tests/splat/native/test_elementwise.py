@@ -88,9 +88,6 @@ def test_other_strides_are_taken_and_other_types_and_lengths_refused(name: str) 
         getattr(native, f"{name}_backward")(torch.zeros(3), torch.zeros(4), 1)
 
 
-native = pytest.importorskip("xrgs._native")
-
-
 def step(count: int, seed: int = 0) -> tuple[Tensor, Tensor]:
     """Image-plane gradients [N, 2] and visibility [N]."""
     generator = torch.Generator().manual_seed(seed)

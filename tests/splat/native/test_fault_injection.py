@@ -6,8 +6,6 @@ Only a build with fault injection can do this; `tests/csrc/sanitize.sh` makes on
 from __future__ import annotations
 
 import itertools
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
@@ -17,6 +15,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.runtime.programs import run_python
 from tests.splat.scenes import make_camera, make_scene
 from xrgs.splat.gaussians import PARAMETERS
 from xrgs.splat.native.rasterizer import render_config
@@ -201,7 +200,5 @@ print("done")
 
 
 def test_a_thread_that_cannot_start_is_done_without() -> None:
-    result = subprocess.run(  # where the pool has no thread yet
-        [sys.executable, "-c", FEWER_THREADS], capture_output=True, text=True, check=False
-    )
+    result = run_python(FEWER_THREADS)  # where the pool has no thread yet
     assert result.stdout == "done\n", result.stderr

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import os
 import platform
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+
+from tests.runtime.programs import run_python
 
 _native = pytest.importorskip("xrgs._native")
 CPUINFO = Path("/proc/cpuinfo")
@@ -33,11 +33,6 @@ def test_the_instruction_sets_are_those_that_linux_names() -> None:
 
 @pytest.mark.parametrize(("value", "says"), [("portable", "portable"), ("sse9", "XRGS_ISA")])
 def test_the_environment_chooses_the_instruction_set(value: str, says: str) -> None:
-    result = subprocess.run(
-        [sys.executable, "-P", "-c", "from xrgs import _native; print(_native.isa())"],
-        env=os.environ | {"XRGS_ISA": value},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    script = "from xrgs import _native; print(_native.isa())"
+    result = run_python(script, env=os.environ | {"XRGS_ISA": value})
     assert says in (result.stdout if value == "portable" else result.stderr)

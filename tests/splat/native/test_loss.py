@@ -7,11 +7,9 @@ from functools import partial
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from torch import Tensor
-from torch.nn.functional import interpolate
 
+from tests.splat.scenes import similar_pair
 from xrgs.splat.loss import photometric_loss, prepare_target
 
 pytest.importorskip("xrgs._native")
@@ -19,14 +17,9 @@ pytest.importorskip("xrgs._native")
 native_loss = partial(photometric_loss, l1=0.8, ssim=0.2, backend="native")
 
 
-def pair(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor]:
-    """Two float32 images of the same smooth shapes, each with noise of its own."""
-    generator = torch.Generator().manual_seed(seed)
-    coarse = torch.rand(1, 3, height // 8 + 2, width // 8 + 2, generator=generator)
-    smooth = interpolate(coarse, size=(height, width), mode="bicubic")[0].permute(1, 2, 0)
-    noise = torch.rand(2, height, width, 3, generator=generator)
-    image, photograph = smooth + 0.1 * noise
-    return image, photograph
+def pair(height: int, width: int) -> tuple[Tensor, Tensor]:
+    image, photograph = similar_pair(height, width)
+    return image.float(), photograph.float()
 
 
 def value_and_gradient(
@@ -111,30 +104,6 @@ def test_it_is_the_torch_loss_in_double(
     assert not without.requires_grad
 
 
-@settings(max_examples=25)
-@given(size=st.tuples(st.integers(11, 60), st.integers(11, 90)), seed=st.integers(0, 10**6))
-def test_any_size(size: tuple[int, int], seed: int) -> None:
-    image, photograph = pair(*size, seed)
-    exact, exact_gradient = value_and_gradient(image.double(), photograph.double(), "torch")
-    loss, gradient = value_and_gradient(image, photograph, "native")
-    assert loss == pytest.approx(exact, abs=1e-6)
-    # Where the two images are within rounding of one another L1's gradient may have either sign.
-    certain = (image - photograph).abs() > 1e-7
-    torch.testing.assert_close(
-        gradient.double()[certain],
-        exact_gradient[certain],
-        rtol=0,
-        atol=2e-5 * exact_gradient.abs().max().item(),
-    )
-
-
-def test_the_same_image_has_neither_loss_nor_gradient() -> None:
-    image, _ = pair(40, 50)
-    loss, gradient = value_and_gradient(image, image, "native")
-    assert loss == 0
-    assert (gradient == 0).all()
-
-
 @pytest.mark.parametrize(
     ("of", "where"),
     [
@@ -160,33 +129,6 @@ def test_nan_shows_where_a_window_has_it_and_nowhere_else(of: str, where: tuple[
     assert gradient[far].isfinite().all()
     others = [c for c in range(3) if channel and c not in channel]
     assert gradient[..., others].isfinite().all()
-
-
-def test_strided_tensors_count_the_same() -> None:
-    image, photograph = pair(20, 24)
-    weight, target = random_weights(20, 24), prepare_target(photograph)
-    planar = image.permute(2, 0, 1).contiguous().permute(1, 2, 0)
-    strided = weight.t().contiguous().t()
-    assert not planar.is_contiguous()
-    assert not strided.is_contiguous()
-    expected = native_loss(image, target, pixel_weight=weight)
-    assert torch.equal(native_loss(planar, target, pixel_weight=strided), expected)
-
-
-def test_weighted_and_summed_losses_add_up() -> None:
-    image, first = pair(20, 24)
-    _, second = pair(20, 24, seed=1)
-    _, by_first = value_and_gradient(image, first, "native")
-    _, by_second = value_and_gradient(image, second, "native")
-    leaf = image.clone().requires_grad_()
-    losses = [native_loss(leaf, prepare_target(p)) for p in (first, second, first)]
-    total = losses[0] + 0.25 * losses[1] + losses[2]
-    torch.autograd.backward(total, retain_graph=True)
-    assert leaf.grad is not None
-    expected = 2 * by_first + 0.25 * by_second
-    torch.testing.assert_close(leaf.grad, expected, rtol=1e-6, atol=1e-9)
-    torch.autograd.backward(total)  # what the first time gave out must still be there
-    torch.testing.assert_close(leaf.grad, 2 * expected, rtol=1e-6, atol=1e-9)
 
 
 def test_types_are_checked() -> None:

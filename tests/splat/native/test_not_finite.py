@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-import subprocess
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,6 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.runtime.programs import run_python
 from tests.splat.scenes import draw
 from xrgs.splat.cameras import Camera
 from xrgs.splat.settings import RasterSettings
@@ -185,12 +184,7 @@ def test_fuzzing(count: int) -> None:
         "import sys; sys.path.append(sys.argv.pop())\n"
         "from tests.splat.native.fuzz_rasterizer import main; sys.exit(main(sys.argv[1:]))"
     )
-    result = subprocess.run(
-        [sys.executable, "-P", "-c", code, "--count", str(count), str(Path(__file__).parents[3])],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    result = run_python(code, "--count", str(count), str(Path(__file__).parents[3]))
     assert result.returncode == 0, result.stdout + result.stderr
     refused = int(result.stdout.split(f"{count} scenes, ")[1].split(" ")[0])
     # Sizes beyond 1e18 px are asked for by some cases; of the others an error is no way out.

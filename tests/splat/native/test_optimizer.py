@@ -171,14 +171,6 @@ def test_torch_goes_on_from_our_state_and_we_from_its() -> None:
         assert_same(mixed, theirs, step)
 
 
-def test_nan_shows_where_it_is() -> None:
-    of = optimizer(20, "native")
-    gradients = normal_parameters(20, 1)
-    gradients["scales"][3, 1] = float("nan")
-    take_step(of, gradients)
-    assert of.gaussians.scales.isnan().nonzero().tolist() == [[3, 1]]
-
-
 def take_step_of_a_view(of: SplatOptimizer, gradients: dict[str, Tensor], degree: int) -> None:
     of_others = {name: gradients[name] for name in PARAMETERS if name != "shN"}
     take_step(of, of_others, make_camera(turned=True), degree)

@@ -16,7 +16,6 @@ from tests.splat.scenes import (
     normal_parameters,
     take_step,
 )
-from xrgs.splat.native.elementwise import accumulate_statistics
 from xrgs.splat.native.rasterizer import render_config
 from xrgs.splat.native.resample import banded_matrix
 from xrgs.splat.settings import CullingOptions, RasterSettings
@@ -102,16 +101,6 @@ def test_a_backward_pass_through_values_from_before_a_step_is_refused(
     take_step(of, gradients, make_camera() if with_camera else None, 3)
     with pytest.raises(RuntimeError, match="modified by an inplace operation"):
         torch.autograd.backward(saved)
-
-
-def test_a_backward_pass_through_statistics_from_before_is_refused() -> None:
-    for place in (0, 1):
-        factor = torch.ones(N, requires_grad=True)
-        sums = torch.zeros(N), torch.zeros(N)
-        product = (factor * sums[place]).sum()
-        accumulate_statistics(torch.ones(N, 2), torch.ones(N).bool(), (1.0, 1.0), *sums)
-        with pytest.raises(RuntimeError, match="modified by an inplace operation"):
-            torch.autograd.backward(product)
 
 
 # --- memory that is used again -------------------------------------------------------------------

@@ -52,7 +52,6 @@ class View:
 
     gradient: Tensor  # [N, 2] per px
     visible: Tensor  # [N]
-    absgrad: Tensor | None = None  # [N, 2], what gsplat also has of a render with absgrad
     group: str = "HR"
 
 
@@ -121,8 +120,6 @@ class Theirs(Trainer):
             "radii": view.visible[None, :, None].expand(-1, -1, 2).int(),
             "means2d": SimpleNamespace(grad=view.gradient[None]),
         }
-        if view.absgrad is not None:
-            info["means2d"].absgrad = view.absgrad[None]
         with self.drawing(), patch("torch.randn", randn_in_double):
             self.strategy.step_post_backward(self.params, self.optimizers, self.state, step, info)
         # 1.5.3's own never happens; this is the condition that its pull request 776 restores.

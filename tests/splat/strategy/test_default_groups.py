@@ -18,6 +18,12 @@ from xrgs.splat.settings import DensifySettings
 from xrgs.splat.strategy.base import Groups, Refinement, Thresholds
 
 FINE, COARSE = Thresholds(2e-4, 0.005), Thresholds(4e-4, 0.02)
+#: Numbers of Gaussians, and the groups of the views in their order.
+ANY_SCENE = given(
+    count=st.integers(1, 60),
+    order=st.text("hl", min_size=1, max_size=6),
+    seed=st.integers(0, 2**32 - 1),
+)
 
 
 def values_of(count: int, rng: np.random.Generator) -> dict[str, Tensor]:
@@ -76,11 +82,7 @@ def gsplats(values: dict[str, Tensor], views: list[View], thresholds: Thresholds
 
 
 @settings(max_examples=30)
-@given(
-    count=st.integers(1, 60),
-    order=st.text("hl", min_size=1, max_size=6),
-    seed=st.integers(0, 2**32 - 1),
-)
+@ANY_SCENE
 def test_each_group_grows_by_its_own_statistics(count: int, order: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
     values, views = values_of(count, rng), views_of(order, count, rng)
@@ -99,11 +101,7 @@ def test_each_group_grows_by_its_own_statistics(count: int, order: str, seed: in
 
 
 @settings(max_examples=30)
-@given(
-    count=st.integers(1, 60),
-    order=st.text("hl", min_size=1, max_size=6),
-    seed=st.integers(0, 2**32 - 1),
-)
+@ANY_SCENE
 def test_an_hr_views_gaussian_is_pruned_by_the_hr_threshold(
     count: int, order: str, seed: int
 ) -> None:
@@ -152,11 +150,7 @@ def test_pooled_the_last_view_decides_for_all(order: str) -> None:
 
 
 @settings(max_examples=30)
-@given(
-    count=st.integers(1, 60),
-    order=st.text("hl", min_size=1, max_size=6),
-    seed=st.integers(0, 2**32 - 1),
-)
+@ANY_SCENE
 def test_by_own_thresholds_all_views_share_one_mean(count: int, order: str, seed: int) -> None:
     """As gsplat with a threshold of 1, and each gradient divided by its view's threshold."""
     rng = np.random.default_rng(seed)
@@ -181,11 +175,3 @@ def test_the_reset_is_above_every_threshold() -> None:
         assert refinement.reset > 0
         highest = torch.sigmoid(gaussians.opacities.detach()).max().item()
         assert highest == pytest.approx(2 * COARSE.prune_opacity)
-
-
-def test_what_names_no_group_and_no_way_to_decide_is_refused() -> None:
-    rng = np.random.default_rng(4)
-    with pytest.raises(KeyError, match="LR"):
-        ours(values_of(3, rng), views_of("l", 3, rng), Groups({"HR": FINE}, "per_class"))
-    with pytest.raises(ValueError, match="decide=everybody"):
-        Groups({"HR": FINE}, "everybody")

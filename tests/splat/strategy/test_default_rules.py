@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import pytest
 import torch
@@ -17,16 +18,7 @@ from xrgs.splat.strategy.default import DefaultStrategy
 
 WIDTH, HEIGHT = SIZES["HR"]
 NO_HOOKS = StrategyHooks()
-
-
-def strategy_of(
-    values: dict[str, Tensor],
-    settings: DensifySettings | None = None,
-    *,
-    seed: int = 0,
-    groups: Groups | None = None,
-) -> DefaultStrategy:
-    return make_strategy(values, settings, scene_scale=SCENE_SCALE, seed=seed, groups=groups)
+strategy_of = partial(make_strategy, scene_scale=SCENE_SCALE)
 
 
 def uniform(count: int, *, scale: float = 0.01, opacity: float = 0.5) -> dict[str, Tensor]:
@@ -201,15 +193,3 @@ def test_the_group_of_a_gaussian_without_gradients_is_the_last() -> None:
 
 
 # --- state --------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", ["grad2d_sum", "visible_count"])
-def test_state_of_other_gaussians_is_refused(name: str) -> None:
-    strategy = strategy_of(uniform(4))
-    expected = rf"{name} must be torch.float32 \[1, 4\], got "
-    for wrong, got in (
-        (torch.zeros(1, 3), r".* \[1, 3\]"),
-        (torch.zeros(1, 4).double(), "torch.float64"),
-    ):
-        with pytest.raises(ValueError, match=expected + got):
-            strategy.load_state_dict(strategy.state_dict() | {name: wrong})

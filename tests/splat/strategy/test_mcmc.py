@@ -7,14 +7,13 @@ import math
 import numpy as np
 import pytest
 import torch
-from scipy.integrate import quad
 from torch import Tensor
 
 from tests.splat.scenes import make_optimizer, take_step
 from tests.splat.strategy.gsplats import SCENE_SCALE, TheirsMCMC, random_values, relocation
 from xrgs.splat.gaussians import PARAMETERS
 from xrgs.splat.settings import STRATEGIES, DensifySettings
-from xrgs.splat.strategy.base import Groups, Refinement, Thresholds
+from xrgs.splat.strategy.base import Refinement
 from xrgs.splat.strategy.mcmc import MOST_SHARES, MCMCStrategy, share_out
 from xrgs.training import loop
 
@@ -29,7 +28,6 @@ def strategy_of(
     most: int = 1000,
     seed: int = 0,
     backend: str = "torch",
-    groups: Groups | None = None,
 ) -> MCMCStrategy:
     """A strategy that adds Gaussians until there are `most`."""
     return MCMCStrategy(
@@ -38,7 +36,6 @@ def strategy_of(
         scene_scale=SCENE_SCALE,
         generator=torch.Generator().manual_seed(seed),
         view_pixels=most,
-        groups=groups,
     )
 
 
@@ -120,6 +117,8 @@ def test_shares_are_those_of_gsplats_kernel(opacity: float) -> None:
 def test_shares_are_as_opaque_as_the_gaussian_and_have_its_integral(
     opacity: float, shares: int
 ) -> None:
+    from scipy.integrate import quad
+
     of_one = torch.tensor([opacity], dtype=torch.float64)
     shared, factor = (value.item() for value in share_out(of_one, torch.tensor([shares])))
 
@@ -203,24 +202,6 @@ def test_removed_gaussians_leave_the_others_as_they_are() -> None:
     mask = torch.arange(10) % 3 == 0
     assert strategy.remove(mask) == 4
     assert torch.equal(strategy.gaussians.means, values["means"][~mask])
-
-
-def test_a_restored_strategy_draws_what_the_first_one_would() -> None:
-    values = random_start(60)
-    first = strategy_of(values, seed=1)
-    after_step(first, 600)
-    again = strategy_of({name: first.gaussians[name].detach() for name in PARAMETERS}, seed=2)
-    again.load_state_dict(first.state_dict())
-    for strategy in (first, again):
-        after_step(strategy, 700)
-    assert all(torch.equal(first.gaussians[name], again.gaussians[name]) for name in PARAMETERS)
-
-
-def test_groups_and_a_missing_budget_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"^settings\.budget must be above 0"):
-        strategy_of(random_start(5), DensifySettings())
-    with pytest.raises(ValueError, match=r"^groups: "):
-        strategy_of(random_start(5), groups=Groups({"HR": Thresholds(1.0, 1.0)}, "per_class"))
 
 
 def test_the_defaults_are_gsplats() -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-
 import pytest
 import torch
 
@@ -22,14 +20,6 @@ CAMERA = Camera(
 )
 
 
-NATIVE = pytest.param(
-    "native",
-    marks=pytest.mark.skipif(
-        importlib.util.find_spec("xrgs._native") is None, reason="the native backend isn't built"
-    ),
-)
-
-
 def one(sigma: float) -> Gaussians:
     """A white Gaussian in the middle of the middle pixel, `sigma` px large."""
     return Gaussians(
@@ -42,7 +32,6 @@ def one(sigma: float) -> Gaussians:
     )
 
 
-@pytest.mark.parametrize("backend", ["torch", NATIVE])
 @pytest.mark.parametrize(("sigma", "eps2d"), [(0.2, 0.1), (0.7, 0.3), (3.0, 0.3)])
 def test_a_small_gaussian_fades_instead_of_growing_brighter(
     sigma: float, eps2d: float, backend: str

@@ -11,7 +11,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tests.conftest import composed as compose
 from tests.splat.scenes import noise
 from xrgs.config import FloatersConf
 from xrgs.splat.cameras import Camera
@@ -19,8 +18,7 @@ from xrgs.splat.gaussians import Gaussians
 from xrgs.splat.settings import DensifySettings
 from xrgs.training.components import Step
 from xrgs.training.components.floaters import Floaters
-from xrgs.training.dataset import Dataset, LoadedView
-from xrgs.training.loop import train
+from xrgs.training.dataset import LoadedView
 
 EVERY = 100
 """Steps between two removals in a run of 30,000."""
@@ -115,16 +113,3 @@ def test_a_view_without_points_in_its_image_removes_nothing(looking: list[Loaded
     removed = guard([view], behind, 1.0).to_prune(gaussians_at(before), Step(0, 30_000, view))
     assert removed is not None
     assert not removed.any()
-
-
-def test_a_trained_model_has_no_gaussian_before_the_limit(data: Dataset) -> None:
-    """One of 200 first Gaussians is close to the cameras, which are all in one place."""
-    generator = torch.Generator().manual_seed(1)
-    points = torch.rand(200, 3, generator=generator) - 0.5 + torch.tensor([0.0, 0.0, 2.0])
-    points[0] = torch.tensor([0.01, 0.02, 0.3])
-    data = replace(data, points=points, colors=torch.rand(200, 3, generator=generator))
-    conf = compose("train.steps=40", "splat.backend=auto", "splat.densify.stop=0")
-    conf.components.floaters.near_share = 0.5
-    result = train(data, conf)
-    assert result.gaussians.means[:, 2].min() > 0.7
-    assert result.history[-1]["pruned_by_components"] == 1

@@ -64,17 +64,20 @@ def true_depths(rays: Array, viewmat: Array) -> Array:
     return nearest
 
 
-def true_scene(count: int, width: int) -> TrueScene:
-    """Render views of the embedded scene, `width` px wide, two thirds at `FACTOR` times less."""
+def true_scene(count: int, width: int, samples: int = 1) -> TrueScene:
+    """Render views of the embedded scene, `width` px wide, two thirds at `FACTOR` times less.
+
+    A pixel of an HR view has the mean of `samples` x `samples`.
+    """
     height = width * 3 // 4
     K, viewmats = procedural.intrinsics(width, height), procedural.viewmats(count)
     textures = {name: still_life._pyramid(*of) for name, of in procedural.TEXTURES.items()}
     images = [
         still_life.render(
             *(still_life.solids(), textures, torch.from_numpy(K), torch.from_numpy(viewmat)),
-            *(width, height),
+            *(width, height, samples if number % 3 == 0 else 1),
         )
-        for viewmat in viewmats
+        for number, viewmat in enumerate(viewmats)
     ]
     points, colors = _points(K, viewmats, images)
     world = normalize_scene(viewmats, points)

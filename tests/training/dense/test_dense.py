@@ -11,12 +11,11 @@ import pytest
 import torch
 
 from tests.conftest import composed as compose
-from tests.training.conftest import comparable, same
+from tests.training.conftest import Losses, killed_and_not, same
 from tests.training.dense.conftest import TrueScene
 from xrgs.splat.backend import resolve_backend
 from xrgs.splat.gaussians import Gaussians
 from xrgs.training import dense
-from xrgs.training.checkpoint import Checkpoint
 from xrgs.training.dataset import Dataset
 from xrgs.training.loop import train
 
@@ -109,30 +108,14 @@ def test_two_views_are_enough_and_too_little_coverage_is_not(
 
 
 @pytest.mark.slow
-def test_a_continued_run_ends_with_the_same_bits(scene: TrueScene, tmp_path: Path) -> None:
+def test_a_continued_run_ends_with_the_same_bits(
+    scene: TrueScene, losses: Losses, tmp_path: Path
+) -> None:
     data = replace(scene.data, train=scene.data.train[:5])
     conf = compose(
         *("train.steps=6", "splat.backend=auto", "+ablation=plus"),
         *("splat.densify.start=0", "splat.densify.every=5000"),
     )
-    whole = train(data, conf)
-    assert whole.stage_seconds["start"] > 0
+    whole, continued = killed_and_not(data, conf, losses, tmp_path)
     assert sum(whole.stage_seconds.values()) == pytest.approx(whole.seconds, rel=0.1)
-
-    class Kill(BaseException):
-        pass
-
-    class KilledAfterThree(Checkpoint):
-        def save_if_due(self, step: int) -> float:
-            seconds = super().save_if_due(step)
-            if step == 2:
-                raise Kill
-            return seconds
-
-    with pytest.raises(Kill):
-        train(data, conf, KilledAfterThree(tmp_path / "c.npz", "cell", 1e-9))
-    checkpoint = Checkpoint(tmp_path / "c.npz", "cell", 1e-9)
-    assert checkpoint.load() == 3
-    continued = train(data, conf, checkpoint)
-    assert comparable(continued) == comparable(whole)
     assert continued.stage_seconds["start"] == pytest.approx(whole.stage_seconds["start"], rel=9)

@@ -16,7 +16,6 @@ from xrgs.training.dense.matching import (
     REACH,
     STEP,
     Windows,
-    box_sum,
     costs,
     minimum,
     smoothed,
@@ -40,20 +39,6 @@ def test_correlation_is_that_of_each_window() -> None:
             shrink = np.prod([np.sqrt(v / (v + 1e-5)) for v in map(np.var, pair)])
             np.testing.assert_allclose(computed[0, row, column], expected * shrink, atol=2e-6)
             np.testing.assert_allclose(computed[1, row, column], -expected * shrink, atol=2e-6)
-
-
-def test_correlation_ignores_gain_and_offset_and_flat_windows_have_none() -> None:
-    image = np.random.default_rng(1).random((8, 8)).astype(np.float32)
-    np.testing.assert_allclose(Windows(image).zncc(0.5 * image + 0.2), 1, atol=2e-3)
-    assert not np.any(Windows(image).zncc(np.full_like(image, 0.3)) > 1e-3)
-
-
-def test_box_sums_are_those_of_the_pixels_in_the_image() -> None:
-    image = np.arange(30, dtype=np.float32).reshape(1, 5, 6)
-    sums = box_sum(image)
-    assert sums[0, 2, 2] == image[0, 0:5, 0:5].sum()
-    assert sums[0, 0, 0] == image[0, :3, :3].sum()
-    assert sums[0, 4, 5] == image[0, 2:, 3:].sum()
 
 
 def test_true_depths_cost_least(scene: TrueScene) -> None:
