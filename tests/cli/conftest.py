@@ -5,10 +5,10 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
-import sys
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -69,26 +69,10 @@ def without_heavy(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 @pytest.fixture
-def sweep_here(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> Callable[..., tuple[int, str, str]]:
+def sweep_here(call_command: RunCommand, monkeypatch: pytest.MonkeyPatch) -> RunCommand:
     """(*arguments) -> exit code, stdout and stderr of `xrgs-sweep`, run in this process."""
-    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sweep, "exit_on_signal", nullcontext)  # keep pytest's own signal handlers
-
-    def run(*arguments: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["xrgs-sweep", *arguments])
-        capsys.readouterr()
-        code, message = 0, ""
-        try:
-            sweep.main()
-        except SystemExit as end:
-            message = end.code if isinstance(end.code, str) else ""
-            code = 1 if message else int(end.code or 0)
-        out, err = capsys.readouterr()
-        return code, out, err + message
-
-    return run
+    return partial(call_command, "sweep")
 
 
 @dataclass

@@ -41,8 +41,8 @@ def cell_id(conf: Conf, variant: str = "v") -> str:
 
 @pytest.fixture(scope="module")
 def confs(compose: Callable[..., Conf]) -> dict[str, Conf]:
-    """Configs with and without components, on both backends."""
-    arms = {"baseline": (), "mip": ("+ablation=mip",), "xrgs": ("+ablation=xrgs",)}
+    """Configs with and without a component, on both backends."""
+    arms = {"baseline": (), "mip": ("+ablation=mip",)}
     return {
         f"{arm} {backend}": compose(*changes, f"splat.backend={backend}")
         for arm, changes in arms.items()

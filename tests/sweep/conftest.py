@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import os
 from collections.abc import Callable, Mapping
 from copy import deepcopy
 from dataclasses import dataclass, replace
@@ -105,33 +103,6 @@ def cells(compose: Callable[..., Conf], store: Store) -> Cells:
     """The cells of `store`, of a config on the torch backend."""
     given = ("scene=motorcycle", "splat.backend=torch", f"store={store.path}", "threads=1")
     return Cells(store, compose(*given))
-
-
-@pytest.fixture
-def sick(monkeypatch: pytest.MonkeyPatch) -> Callable[[str, int], None]:
-    """(end of a path, number of an error) -> files with that end can't be read from now on.
-
-    The number 0 makes all files readable again.
-    """
-    opened, opened_io = os.open, io.open
-
-    def sicken(end: str, number: int) -> None:
-        def check(path: object) -> None:
-            if number and isinstance(path, (str, Path)) and str(path).endswith(end):
-                raise OSError(number, os.strerror(number), str(path))
-
-        def os_open(path: Any, *given: Any, **named: Any) -> int:
-            check(path)
-            return opened(path, *given, **named)
-
-        def io_open(path: Any, *given: Any, **named: Any) -> Any:
-            check(path)
-            return opened_io(path, *given, **named)
-
-        monkeypatch.setattr(os, "open", os_open)
-        monkeypatch.setattr(io, "open", io_open)
-
-    return sicken
 
 
 @cache

@@ -101,10 +101,10 @@ def intact(store: Store) -> Store:
 
 
 def test_a_cell_that_cannot_be_read_now_is_listed_with_the_reason(
-    intact: Store, sick: Callable[[str, int], None], monkeypatch: pytest.MonkeyPatch
+    intact: Store, unreadable: Callable[..., None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     number = errno.ESTALE
-    sick("status.json", number)
+    unreadable("status.json", number)
     assert {cell.state.name for cell in intact.cell_rows()} == {"failed"}
     text = describe(intact.path)
     assert "\nfailed:\n" in text

@@ -225,12 +225,12 @@ def planned(
 def test_a_cell_that_can_not_be_read_fails_and_the_others_are_trained(
     planned: tuple[Store, Trainer, list[PlannedCell]],
     study: Callable[..., Study],
-    sick: Callable[[str, int], None],
+    unreadable: Callable[..., None],
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     store, trainer, plan = planned
     before = files(store.cell(str(plan[0].cell_id)).path)
-    sick(f"{plan[0].cell_id}/status.json", errno.EIO)
+    unreadable(f"{plan[0].cell_id}/status.json", errno.EIO)
     with SweepMonitor(store.cells_folder) as monitor:
         made = study("store=s")
         plan = made._identified(plan, store)
@@ -241,7 +241,7 @@ def test_a_cell_that_can_not_be_read_fails_and_the_others_are_trained(
     assert f"{plan[0].cell_id}/status.json: {os.strerror(errno.EIO)}" in text
     assert "retry=failed" in text
     assert [row.error for row in record(final)] == [None, None]
-    sick("", 0)
+    unreadable("", 0)
     assert files(store.cell(str(plan[0].cell_id)).path) == before
     assert "1 of 2 cells done, 1 failed" in capsys.readouterr().err
 
@@ -260,7 +260,7 @@ def test_the_notes_of_a_variant_are_given_once_for_all_of_its_cells(
 def test_a_count_that_can_not_be_read_fails_the_cell(
     planned: tuple[Store, Trainer, list[PlannedCell]],
     study: Callable[..., Study],
-    sick: Callable[[str, int], None],
+    unreadable: Callable[..., None],
     compose: Callable[..., config.Conf],
 ) -> None:
     store, _, (reference, _) = planned
@@ -268,7 +268,7 @@ def test_a_count_that_can_not_be_read_fails_the_cell(
     cell = PlannedCell(reference.spec, compose(*control), "v")
     assert cell.reference is not None
     done = replace(reference, state=store.cell(str(reference.cell_id)).state())
-    sick("summary.json", errno.EIO)
+    unreadable("summary.json", errno.EIO)
     waiting = study("store=s")._with_count(cell, {cell.reference: done}, store)
     assert "summary.json" in str(waiting.error)
     assert waiting.conf == cell.conf
