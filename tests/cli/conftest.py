@@ -27,6 +27,8 @@ from xrgs.sweep import job
 
 RunCommand = Callable[..., tuple[int, str, str]]
 SMOKE = ("scene=motorcycle", "preset=smoke", "train.steps=8")
+#: The command line of `swept`.
+SWEEP = ("+ablation=consistency", *SMOKE, "track=csv", "threads=1", "store=s")
 #: Modules that take long to import, and that a plan and `--help` must do without.
 HEAVY = ("kornia", "matplotlib", "pandas", "pycolmap", "scipy", "skimage", "torch")
 
@@ -130,12 +132,18 @@ def children(monkeypatch: pytest.MonkeyPatch) -> Children:
 def swept(
     forked_command: RunCommand, made_once: Callable[..., Path], smoke_variants: Path
 ) -> tuple[Path, str]:
-    """A folder with a finished smoke sweep in its store `s`, and what was printed."""
+    """A folder with a finished smoke sweep in its store `s`, and what was printed.
+
+    The store's folder `cells` is a link.
+    """
 
     def sweep_once(folder: Path) -> None:
         shutil.copytree(smoke_variants, folder / "s" / "variants")
-        code, out, err = forked_command("sweep", folder, "+ablation=consistency", *SMOKE, "store=s")
+        (folder / "disk").mkdir()
+        (folder / "s" / "cells").symlink_to(folder / "disk")
+        code, out, err = forked_command("sweep", folder, *SWEEP)
         assert code == 0, err
+        assert err.count("training cell") == 2
         (folder / "printed").write_text(out, encoding="utf-8")
 
     folder = made_once("swept", sweep_once)

@@ -370,6 +370,7 @@ def test_a_native_module_that_cannot_be_loaded_is_an_error_of_one_line(
         cell_id(baseline)
 
 
+@pytest.mark.slow
 def test_planning_a_native_cell_needs_no_torch() -> None:
     script = (
         "import sys\nfrom xrgs.composing import compose\nfrom xrgs.store import identity\n"

@@ -24,7 +24,9 @@ from xrgs.store.cell_folder import CellFolder
 from xrgs.store.identity import cell_id, cell_identity
 from xrgs.store.schema import RecordedCell
 from xrgs.store.store import Store
+from xrgs.sweep.axes import CellSpec
 from xrgs.sweep.job import SweepSession
+from xrgs.sweep.plan import PlannedCell
 from xrgs.sweep.study import Study
 
 #: The id of a variant that is not built.
@@ -37,6 +39,29 @@ SUMMARY = {
     "evaluations": 500,
     "steps": 20,
 }
+
+
+def content(folder: Path) -> dict[str, tuple[int, int, bytes]]:
+    """Inode, time and bytes of every file of a folder."""
+    files = [file for file in folder.rglob("*") if file.is_file()]
+    stats = {file: file.stat() for file in files}
+    return {
+        file.relative_to(folder).as_posix(): (stat.st_ino, stat.st_mtime_ns, file.read_bytes())
+        for file, stat in stats.items()
+    }
+
+
+def planned(conf: Conf, label: str, *shared: str) -> PlannedCell:
+    """A cell of the variant `v`."""
+    identity = cell_identity(conf, "v")
+    return PlannedCell(CellSpec(label, "", shared, ()), conf, "v", identity, cell_id(identity))
+
+
+def finish(store: Store, name: str) -> None:
+    """Write the least that a done cell has."""
+    cell = store.cell(name)
+    (cell.path / "scores.csv").write_text("view\na\n")
+    cell.finish(["a"], {})
 
 
 @pytest.fixture

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.sweep.conftest import content
 from xrgs.config import Conf
 from xrgs.mixture import variant
 from xrgs.mixture.views import Variant
@@ -62,12 +63,6 @@ def cell(compose: Callable[..., Conf], built: Variant, tmp_path: Path) -> CellFo
     return cell
 
 
-def files(folder: Path) -> dict[str, tuple[int, bytes]]:
-    """Time and content of every file."""
-    found = [file for file in folder.rglob("*") if file.is_file()]
-    return {file.name: (file.stat().st_mtime_ns, file.read_bytes()) for file in found}
-
-
 @pytest.mark.slow
 def test_a_worker_that_wakes_up_after_a_takeover_writes_into_its_own_folder_alone(
     cell: CellFolder, built: Variant, tmp_path: Path
@@ -83,10 +78,10 @@ def test_a_worker_that_wakes_up_after_a_takeover_writes_into_its_own_folder_alon
     begin_attempt(cell)
     (cell.path / "scores.csv").write_text("view\na\n")
     cell.finish(["a"], {})
-    before = files(cell.path)
+    before = content(cell.path)
     child.send_signal(signal.SIGCONT)
     child.wait(60)
-    assert files(cell.path) == before
+    assert content(cell.path) == before
     assert cell.state().name == "done"
     assert CellFolder(own).state().name == "done"  # where nobody looks any more
 
@@ -98,10 +93,10 @@ def test_a_worker_that_starts_after_a_takeover_does_nothing(
     monkeypatch.chdir(tmp_path)  # which is left at the end
     request = job.cell_request(built.folder, cell)
     begin_attempt(cell)
-    before = files(cell.path)
+    before = content(cell.path)
     for _ in range(2):  # another folder has its name, and then none
         with pytest.raises(job.WorkError, match="another attempt at the cell has begun"):
             job._WORK["cell"](request)
-        assert files(cell.path) == before
+        assert content(cell.path) == before
         shutil.rmtree(cell.path, ignore_errors=True)
         before = {}

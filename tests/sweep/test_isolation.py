@@ -19,6 +19,7 @@ from typing import Any
 
 import pytest
 
+from tests.sweep.conftest import content
 from xrgs.store.store import Store
 
 pytestmark = pytest.mark.slow
@@ -73,12 +74,6 @@ else:  # no report is made, which takes as long as all else
 
 def status(cell: Path) -> dict[str, str]:
     return dict(json.loads((cell / "status.json").read_text()))
-
-
-def files(cell: Path) -> dict[str, tuple[int, bytes]]:
-    """Time and content of every file."""
-    found = [file for file in cell.rglob("*") if file.is_file()]
-    return {file.name: (file.stat().st_mtime_ns, file.read_bytes()) for file in found}
 
 
 @pytest.fixture(scope="module")
@@ -148,7 +143,7 @@ def test_each_fault_is_its_cell_s_status_and_the_others_finish(built: tuple[Any,
 def test_a_cell_that_hangs_is_ended_at_its_limit_and_fail_fast_starts_nothing_more(
     sweeps: Any,
 ) -> None:
-    before = files(sweeps.cells()[2])
+    before = content(sweeps.cells()[2])
     code, _, err = sweeps.run(*SMOKE, "seed=2,4,7", "limits.minutes=0.1", "fail_fast=true")
     assert code == 1
     assert (sweeps.folder / "hangs").exists()
@@ -157,7 +152,7 @@ def test_a_cell_that_hangs_is_ended_at_its_limit_and_fail_fast_starts_nothing_mo
     assert err.count("training cell") == 1
     assert 7 not in sweeps.cells()
     # What had failed is left as it was, for nobody has asked for another try.
-    assert files(sweeps.cells()[2]) == before
+    assert content(sweeps.cells()[2]) == before
     assert "retry=failed" in err
     assert "SIGKILL" in err
 
@@ -180,7 +175,7 @@ def test_a_killed_sweep_is_taken_over_and_two_at_once_train_each_cell_once(
     assert [file.name for file in (sweeps.folder / "s" / "locks").iterdir()] == [
         f"{sweeps.cells()[4].name}.0"
     ]
-    before = files(sweeps.cells()[0])
+    before = content(sweeps.cells()[0])
     arguments = (*SMOKE, "seed=4,5,0")
     (sweeps.folder / "healed").touch()
     both = [sweeps.start(*arguments) for _ in range(2)]
@@ -193,7 +188,7 @@ def test_a_killed_sweep_is_taken_over_and_two_at_once_train_each_cell_once(
     assert table == other
     assert "failed" not in table
     assert all(status(sweeps.cells()[seed])["state"] == "done" for seed in (4, 5))
-    assert files(sweeps.cells()[0]) == before
+    assert content(sweeps.cells()[0]) == before
     assert not list((sweeps.folder / "s" / "locks").iterdir())
 
 

@@ -16,6 +16,7 @@ import pytest
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
+from tests.sweep.conftest import content
 from xrgs.errors import XrgsError
 from xrgs.mixture import variant
 from xrgs.photos import scenes
@@ -215,13 +216,6 @@ def test_a_cell_ends_with_its_sweep_and_is_unfinished(
     later = cells.plan(seed=1)
     assert run(SweepSession(session.folder), cells, later.id) == STOPPED
     assert later.state().name == "planned"  # no further job has begun
-
-
-def content(folder: Path) -> dict[str, tuple[int, int, bytes]]:
-    """Inode, time and bytes of every file of a folder."""
-    files = [file for file in folder.rglob("*") if file.is_file()]
-    stats = {file: file.stat() for file in files}
-    return {f.name: (s.st_ino, s.st_mtime_ns, f.read_bytes()) for f, s in stats.items()}
 
 
 def take_over(store: Store, cell_id: str) -> None:
