@@ -36,7 +36,6 @@ from hypothesis import HealthCheck, settings
 
 from tests import forks, pdflatex
 from xrgs import composing, config
-from xrgs.errors import XrgsError
 from xrgs.evaluation.lpips import weights
 from xrgs.mixture import variant
 from xrgs.safeio import code
@@ -224,7 +223,8 @@ _incomplete: set[tuple[str, ...]] = set()
 def composed(*overrides: str) -> config.Conf:
     """Return `composed_by_hydra`, but set plain values in the config of the other words.
 
-    tests/test_config.py compares the two. Whatever is not plain, or wrong, is left to Hydra.
+    tests/test_config.py compares the two. What is not plain, and unknown keys and wrong types, are
+    left to Hydra.
     """
     plain = [word.split("=") for word in overrides if _PLAIN.fullmatch(word)]
     others = tuple(word for word in overrides if not _PLAIN.fullmatch(word))
@@ -241,7 +241,7 @@ def composed(*overrides: str) -> config.Conf:
             group = reduce(getitem, groups, values)
             group[name] = _value_like(group[name], text)
         return composing.to_conf(values)  # type: ignore[arg-type]
-    except (KeyError, TypeError, XrgsError):  # an unknown key, a wrong type or value
+    except (KeyError, TypeError):  # an unknown key, a wrong type
         return composed_by_hydra(*overrides)
 
 

@@ -94,6 +94,7 @@ def test_words_change_no_id(package: Path, confs: dict[str, Conf]) -> None:
         assert ids_after(edited(package / name, old, new), confs)[1] == set(), (name, new)
 
 
+@pytest.mark.slow
 def test_every_python_version_gives_the_same_digest() -> None:
     """Tokens of f-strings and the dump of a syntax tree differ between versions."""
     expected = code.code_digest("splat", "training", "csrc", "report")
