@@ -36,7 +36,6 @@ from hypothesis import HealthCheck, settings
 
 from tests import forks, pdflatex
 from xrgs import composing, config
-from xrgs.errors import XrgsError
 from xrgs.evaluation.lpips import weights
 from xrgs.mixture import variant
 from xrgs.safeio import code
@@ -61,47 +60,16 @@ def pytest_collection() -> Generator[None, object, object]:
     It stays until the end, so that tests needn't look through it either.
     """
     gc.disable()
+    _hydra_reads_equal_text_once()
     try:
         return (yield)
     finally:
-        gc.collect()
         gc.freeze()
         gc.set_threshold(50_000)  # hypothesis notes each time that garbage is looked for
         gc.enable()
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark exhaustive tests as slow too, and put files with slow tests first.
-
-    `-m "not slow"` replaces the `-m` of pyproject.toml. With `-n`, one worker runs a file: a long
-    one at the end would leave the other workers idle.
-    """
-    for item in items:
-        if item.get_closest_marker("exhaustive"):
-            item.add_marker("slow")
-    slow = {item.path for item in items if item.get_closest_marker("slow")}
-    items.sort(key=lambda item: item.path not in slow)
-
-
-@pytest.fixture(scope="session", autouse=True)
-def _one_torch_thread() -> None:
-    """Let torch use one thread: a second one costs more than it gives on small tensors."""
-    import torch
-
-    torch.set_num_threads(1)
-
-
-@pytest.fixture(scope="session", autouse=True)
-def _no_disk_is_waited_for() -> Iterator[None]:
-    """Sync nothing in this process: no power fails while tests run."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(os, "fsync", lambda _: None)
-        yield
-
-
-@pytest.fixture(scope="session", autouse=True)
-def _hydra_reads_equal_text_once() -> Iterator[None]:
+def _hydra_reads_equal_text_once() -> None:
     """Keep what Hydra parses of a word and of a file: most of the time of a config goes there."""
     words: dict[tuple[str, str], Any] = {}
     files: dict[tuple[str, str], bytes] = {}
@@ -121,14 +89,26 @@ def _hydra_reads_equal_text_once() -> Iterator[None]:
             files[key] = pickle.dumps(load(stream, Loader))
         return pickle.loads(files[key])  # noqa: S301 - our own, and much faster than a copy
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(OverridesParser, "parse_rule", parse_once)
-        patch.setattr(yaml, "load", load_once)
-        yield
+    patch = pytest.MonkeyPatch()
+    patch.setattr(OverridesParser, "parse_rule", parse_once)
+    patch.setattr(yaml, "load", load_once)
 
 
-@pytest.fixture(scope="session", autouse=True)
-def _equal_source_is_read_once() -> Iterator[None]:
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark exhaustive tests as slow too, and put files with slow tests first.
+
+    `-m "not slow"` replaces the `-m` of pyproject.toml. With `-n`, one worker runs a file: a long
+    one at the end would leave the other workers idle.
+    """
+    for item in items:
+        if item.get_closest_marker("exhaustive"):
+            item.add_marker("slow")
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in slow)
+
+
+def _source_is_read_once(patch: pytest.MonkeyPatch) -> None:
     """Keep what digests of code take from a file's text: tests edit copies of the package."""
     own_imports = code._own_imports.__wrapped__
     found: dict[bytes, frozenset[str]] = {}
@@ -139,41 +119,36 @@ def _equal_source_is_read_once() -> Iterator[None]:
             found[content] = own_imports(file, modified_ns)
         return found[content]
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(code, "meaning", cache(code.meaning))
-        patch.setattr(code, "_own_imports", cache(own_imports_once))
-        yield
+    patch.setattr(code, "meaning", cache(code.meaning))
+    patch.setattr(code, "_own_imports", cache(own_imports_once))
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _terminals_draw() -> Iterator[None]:
-    """Let the terminals of tests draw lines anew, also where the tests run in one that can't."""
+def _process(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Prepare this process for tests, and compile every `table.tex` that they make, in one go.
+
+    This is one fixture, since each test looks at each fixture that all have.
+    """
+    import torch
+
+    torch.set_num_threads(1)  # a second one costs more than it gives on small tensors
+    # A shell's `&` ignores signals that tests send.
+    ignored = [n for n in (signal.SIGINT, signal.SIGHUP) if signal.getsignal(n) is signal.SIG_IGN]
+    for number in ignored:
+        signal.signal(number, signal.SIG_DFL)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("TERM", "xterm")
+        patch.setattr(os, "fsync", lambda _: None)  # no power fails while tests run
+        patch.setenv("TERM", "xterm")  # terminals of tests draw lines anew
+        _source_is_read_once(patch)
         yield
-
-
-@pytest.fixture(scope="session", autouse=True)
-def _every_latex_table_compiles(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Compile every `table.tex` that the tests have made, at the end and in one go."""
-    yield
+    for number in ignored:
+        signal.signal(number, signal.SIG_IGN)
     if pdflatex.PDFLATEX:
         files = tmp_path_factory.getbasetemp().rglob("table.tex")
         texts = dict.fromkeys(file.read_text(encoding="utf-8") for file in sorted(files))
         if texts:
             errors = pdflatex.errors_of(texts, tmp_path_factory.mktemp("pdflatex"))
             assert not errors, errors
-
-
-@pytest.fixture(scope="session", autouse=True)
-def _default_signal_handlers() -> Iterator[None]:
-    """Restore SIGINT and SIGHUP where they are ignored, as after a shell's `&`: tests send them."""
-    ignored = [n for n in (signal.SIGINT, signal.SIGHUP) if signal.getsignal(n) is signal.SIG_IGN]
-    for number in ignored:
-        signal.signal(number, signal.SIG_DFL)
-    yield
-    for number in ignored:
-        signal.signal(number, signal.SIG_IGN)
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -248,7 +223,8 @@ _incomplete: set[tuple[str, ...]] = set()
 def composed(*overrides: str) -> config.Conf:
     """Return `composed_by_hydra`, but set plain values in the config of the other words.
 
-    tests/test_config.py compares the two. Whatever is not plain, or wrong, is left to Hydra.
+    tests/test_config.py compares the two. What is not plain, and unknown keys and wrong types, are
+    left to Hydra.
     """
     plain = [word.split("=") for word in overrides if _PLAIN.fullmatch(word)]
     others = tuple(word for word in overrides if not _PLAIN.fullmatch(word))
@@ -265,7 +241,7 @@ def composed(*overrides: str) -> config.Conf:
             group = reduce(getitem, groups, values)
             group[name] = _value_like(group[name], text)
         return composing.to_conf(values)  # type: ignore[arg-type]
-    except (KeyError, TypeError, XrgsError):  # an unknown key, a wrong type or value
+    except (KeyError, TypeError):  # an unknown key, a wrong type
         return composed_by_hydra(*overrides)
 
 
@@ -359,7 +335,7 @@ def run_command() -> Callable[..., tuple[int, str, str]]:
 @pytest.fixture(scope="session")
 def forked_command() -> Iterator[Callable[..., tuple[int, str, str]]]:
     """Return `run_command` for commands that are forked, which start seconds earlier."""
-    with forks.server() as run:
+    with forks.server(*forks.MODULES) as run:
         yield run
 
 

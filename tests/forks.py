@@ -4,7 +4,7 @@ A process of its own imports for seconds; a fork begins at once, and is as apart
 The children of a sweep, which build variants and train cells, are forks too. They differ from those
 that a user has in one way: a sweep that is killed does not end them.
 
-As a program, `forks.py SOCKET` is the process that forks.
+As a program, `forks.py SOCKET MODULE ...` is the process that imports the modules and forks.
 """
 
 from __future__ import annotations
@@ -20,21 +20,29 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib import import_module
+from importlib.machinery import PathFinder
 from pathlib import Path
+from runpy import run_path
 from types import MappingProxyType
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
-from xrgs.config import LimitsConf
-from xrgs.sweep import job
+if TYPE_CHECKING:
+    from xrgs.config import LimitsConf
+    from xrgs.sweep.job import ProcessEnd
 
 #: The module that is the child of a sweep.
 WORKER = "xrgs.sweep.job"
-#: What the commands and the children of a sweep import, some of it late.
+#: What the package imports from others, some of it late.
+LIBRARIES = (
+    *("hydra", "jinja2", "kornia.losses", "matplotlib.backends.backend_agg", "matplotlib.figure"),
+    *("msgspec", "pandas", "psutil", "pycolmap", "scipy.spatial", "scipy.stats", "tqdm", "tyro"),
+)
+#: What the commands and the children of a sweep import.
 MODULES = (
     *(f"xrgs.cli.{name}" for name in ("bench", "render", "report", "status", "store", "sweep")),
-    *("xrgs.mixture.sfm", "kornia.losses", "matplotlib.backends.backend_agg"),
-    *("xrgs.bench.run", "xrgs.store.cell", "xrgs.report", "xrgs.sweep.rerun"),
-    *("xrgs.viewer.film", "xrgs.viewer.trained"),
+    *("xrgs.mixture.sfm", "xrgs.bench.run", "xrgs.store.cell", "xrgs.report", "xrgs.sweep.rerun"),
+    *("xrgs.viewer.film", "xrgs.viewer.trained", "kornia.losses"),
+    "matplotlib.backends.backend_agg",
 )
 
 
@@ -63,6 +71,8 @@ class _Handler(socketserver.StreamRequestHandler):
         os.chdir(request["folder"])
         os.environ.clear()
         os.environ.update(request["environment"])
+        sys.path[:0] = filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))
+        sys.meta_path.insert(0, PathFinder)  # before that of an editable installation
         for descriptor, name in enumerate((os.devnull, *request["printed"])):
             opened = os.open(name, os.O_RDWR | os.O_APPEND | os.O_CREAT)
             os.dup2(opened, descriptor)
@@ -70,14 +80,15 @@ class _Handler(socketserver.StreamRequestHandler):
         self.wfile.write(b"%d\n" % self._run(**request))
 
     def _run(self, main: str, arguments: Sequence[str], printed: list[str], **_: Any) -> int:
-        """Call the function `main` of a module as if it were a program; return its exit code."""
+        """Run a file, or the function `main` of a module, as a program; return its exit code."""
+        from xrgs.sweep import job
 
         def run_supervised(
             command: Sequence[str],
             limits: LimitsConf | None = None,
             on_poll: Callable[[int], None] = lambda _: None,
             environment: Mapping[str, str] = MappingProxyType({}),
-        ) -> job.ProcessEnd:
+        ) -> ProcessEnd:
             child_main = {"main": WORKER, "arguments": command[-3:], "printed": printed}
             place = {"folder": str(Path.cwd()), "environment": os.environ | environment}
             answers, child = ask(str(self.server.server_address), **child_main, **place)
@@ -85,9 +96,12 @@ class _Handler(socketserver.StreamRequestHandler):
             return job.ProcessEnd(exit_code(answers))
 
         job.run_supervised = run_supervised
-        sys.argv = [main, *arguments]
+        sys.argv = [main.replace("xrgs.cli.", "xrgs-"), *arguments]
         try:
-            import_module(main).main(*arguments if main == WORKER else ())
+            if os.sep in main:
+                run_path(main, run_name="__main__")
+            else:
+                import_module(main).main(*arguments if main == WORKER else ())
         except SystemExit as end:
             if isinstance(end.code, str):
                 print(end.code, file=sys.stderr)  # noqa: T201
@@ -104,15 +118,18 @@ class _Server(socketserver.ForkingMixIn, socketserver.UnixStreamServer):
 
 
 @contextmanager
-def server() -> Iterator[Callable[..., tuple[int, str, str]]]:
+def server(*modules: str) -> Iterator[Callable[..., tuple[int, str, str]]]:
     """Give the function (name, folder, *arguments, **environment) -> exit code, stdout and stderr.
 
-    The name is the command's without "xrgs-".
+    The name is the command's without "xrgs-", or the path of a script. The modules are imported
+    once; without those of the package, each fork imports the package that its PYTHONPATH has.
     """
     # Not in pytest's folder: the path of a socket may have at most 107 bytes.
     with tempfile.TemporaryDirectory(prefix="xrgs-forks-") as folder:
         file = f"{folder}/socket"
-        process = subprocess.Popen([sys.executable, "-P", __file__, file], stdout=subprocess.PIPE)
+        process = subprocess.Popen(
+            [sys.executable, "-P", __file__, file, *modules], stdout=subprocess.PIPE
+        )
         assert process.stdout is not None
         process.stdout.readline()  # it listens
 
@@ -120,7 +137,11 @@ def server() -> Iterator[Callable[..., tuple[int, str, str]]]:
             name: str, where: Path, *arguments: str, **environment: str
         ) -> tuple[int, str, str]:
             printed = [f"{tempfile.mkdtemp(dir=folder)}/{name}" for name in ("stdout", "stderr")]
-            what = {"main": f"xrgs.cli.{name}", "arguments": arguments, "printed": printed}
+            what = {
+                "main": name if os.sep in name else f"xrgs.cli.{name}",
+                "arguments": arguments,
+                "printed": printed,
+            }
             place = {"folder": str(where), "environment": os.environ | environment}
             code = exit_code(ask(file, **what, **place)[0])
             out, err = (Path(path).read_bytes().decode() for path in printed)
@@ -131,8 +152,8 @@ def server() -> Iterator[Callable[..., tuple[int, str, str]]]:
         process.communicate()
 
 
-def _serve(file: str) -> None:
-    for name in MODULES:
+def _serve(file: str, *modules: str) -> None:
+    for name in modules:
         import_module(name)
     with _Server(file, _Handler) as listening:
         print(flush=True)  # noqa: T201
@@ -140,4 +161,4 @@ def _serve(file: str) -> None:
 
 
 if __name__ == "__main__":
-    _serve(sys.argv[1])
+    _serve(*sys.argv[1:])

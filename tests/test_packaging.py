@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import tomllib
 from importlib import metadata
@@ -15,7 +14,6 @@ from packaging.version import Version
 
 import xrgs
 from xrgs.config import CONF_DIR
-from xrgs.splat.backend import REQUIRE_NATIVE, resolve_backend
 
 ROOT = Path(__file__).resolve().parents[1]
 PYPROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
@@ -48,11 +46,6 @@ def test_every_config_file_is_installed(name: str, inside: str) -> None:
     assert len(files) >= 2
     for file in files:
         assert (installed / file).read_bytes() == (ROOT / name / file).read_bytes()
-
-
-@pytest.mark.skipif(os.environ.get(REQUIRE_NATIVE) != "1", reason=f"{REQUIRE_NATIVE} is not 1")
-def test_the_native_backend_is_the_one_in_use() -> None:
-    assert resolve_backend("auto") == "native"
 
 
 def test_every_action_is_pinned_to_a_commit() -> None:

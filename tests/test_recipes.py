@@ -7,17 +7,16 @@ The copy comes first on the path of the commands that are then run as a contribu
 from __future__ import annotations
 
 import json
-import os
 import re
 import shutil
-import subprocess
-import sys
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
 import xrgs
+from tests import forks
 from xrgs.config import CONF_DIR
 
 pytestmark = pytest.mark.slow
@@ -46,6 +45,8 @@ class Copy:
     """A copy of the package with its configs, in which recipes are followed."""
 
     root: Path
+    forked: Callable[..., tuple[int, str, str]]
+    """Runs a command in a process that imports the package of its PYTHONPATH."""
 
     def follow(self, recipe: str) -> None:
         """Put every block of a recipe where the sentence before it says."""
@@ -77,28 +78,28 @@ class Copy:
 
     def run(self, command: str, *arguments: str) -> str:
         """Run `xrgs-<command>` of the copy in its root; return what it printed, without errors."""
-        code = f"import sys; sys.argv[0] = 'xrgs-{command}'; from xrgs.cli.{command} import main"
-        return self._python("-c", f"{code}; main()", *arguments)
+        code, out, err = self.forked(command, self.root, *arguments, PYTHONPATH=str(self.root))
+        assert code == 0, out + err
+        return out + err
 
     def prove(self, *arguments: str) -> str:
         """Run `.ci/prove` on the copy's store `s`."""
-        return self._python(str(ROOT / ".ci" / "prove"), "--store", "s", *arguments)
-
-    def _python(self, *arguments: str) -> str:
-        done = subprocess.run(
-            [sys.executable, "-P", *arguments],
-            cwd=self.root,
-            env=os.environ | {"PYTHONPATH": str(self.root)},
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        assert done.returncode == 0, done.stdout + done.stderr
-        return done.stdout + done.stderr
+        return self.run(str(ROOT / ".ci" / "prove"), "--store", "s", *arguments)
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory, smoke_variants: Path) -> Path:
+def forked() -> Iterator[Callable[..., tuple[int, str, str]]]:
+    """Processes of their own, which have imported all but the package."""
+    with forks.server(*forks.LIBRARIES) as run:
+        yield run
+
+
+@pytest.fixture(scope="module")
+def trained(
+    tmp_path_factory: pytest.TempPathFactory,
+    smoke_variants: Path,
+    forked: Callable[..., tuple[int, str, str]],
+) -> Path:
     """The root of a copy with a store `s` of two trained cells."""
     root = tmp_path_factory.mktemp("trained")
     ignored = shutil.ignore_patterns("__pycache__", "conf", "sweeps")
@@ -108,14 +109,14 @@ def trained(tmp_path_factory: pytest.TempPathFactory, smoke_variants: Path) -> P
     shutil.copytree(sweeps if sweeps.is_dir() else CONF_DIR.parent / "sweeps", root / "sweeps")
     shutil.copytree(ROOT / "hydra_plugins", root / "hydra_plugins")
     shutil.copytree(smoke_variants, root / "s" / "variants")
-    Copy(root).run("sweep", "+ablation=consistency", *SMOKE)
+    Copy(root, forked).run("sweep", "+ablation=consistency", *SMOKE)
     return root
 
 
 @pytest.fixture
-def copy(trained: Path, tmp_path: Path) -> Copy:
+def copy(trained: Path, tmp_path: Path, forked: Callable[..., tuple[int, str, str]]) -> Copy:
     """A copy of that root for one test."""
-    return Copy(shutil.copytree(trained, tmp_path / "copy", symlinks=True))
+    return Copy(shutil.copytree(trained, tmp_path / "copy", symlinks=True), forked)
 
 
 def done_cells(copy: Copy, *arguments: str) -> str:

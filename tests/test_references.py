@@ -40,14 +40,6 @@ def test_every_citation_is_in_the_bibliography() -> None:
     assert not unknown
 
 
-def test_the_methods_that_are_reimplemented_are_cited_where_they_are() -> None:
-    cited = citations()
-    assert {"kerbl2023", "ye2025"} <= cited["xrgs/training/components/densify.py"]
-    assert "yu2024" in cited["xrgs/training/components/mip.py"]
-    assert "yu2024" in cited["conf/ablation/antialiased.yaml"]
-    assert "ye2024absgs" in cited["conf/ablation/absgrad.yaml"]
-
-
 def test_the_citation_file_has_what_its_format_requires() -> None:
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
     assert citation["cff-version"] == "1.2.0"

@@ -20,20 +20,24 @@ from xrgs.mixture.views import Variant
 
 
 @pytest.fixture
-def unreadable(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
-    """(end of a path) -> opening such a file fails from now on, as on a disk that fails."""
+def unreadable(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """(end of a path, number of an error) -> only files with that end can't be read from now on.
 
-    def fail(end: str) -> None:
-        def failing(opened: Callable[..., Any]) -> Callable[..., Any]:
+    The error is that of a disk that fails, if none is given; 0 makes all files readable again.
+    """
+    opened, opened_io = os.open, io.open
+
+    def fail(end: str, number: int = errno.EIO) -> None:
+        def failing(real: Callable[..., Any]) -> Callable[..., Any]:
             def instead(path: Any, *args: Any, **options: Any) -> Any:
-                if str(path).endswith(end):
-                    raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))
-                return opened(path, *args, **options)
+                if number and isinstance(path, (str, Path)) and str(path).endswith(end):
+                    raise OSError(number, os.strerror(number), str(path))
+                return real(path, *args, **options)
 
             return instead
 
-        monkeypatch.setattr(os, "open", failing(os.open))
-        monkeypatch.setattr(io, "open", failing(io.open))
+        monkeypatch.setattr(os, "open", failing(opened))
+        monkeypatch.setattr(io, "open", failing(opened_io))
 
     return fail
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
-import sys
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -27,6 +27,8 @@ from xrgs.sweep import job
 
 RunCommand = Callable[..., tuple[int, str, str]]
 SMOKE = ("scene=motorcycle", "preset=smoke", "train.steps=8")
+#: The command line of `swept`.
+SWEEP = ("+ablation=consistency", *SMOKE, "track=csv", "threads=1", "store=s")
 #: Modules that take long to import, and that a plan and `--help` must do without.
 HEAVY = ("kornia", "matplotlib", "pandas", "pycolmap", "scipy", "skimage", "torch")
 
@@ -69,26 +71,10 @@ def without_heavy(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 @pytest.fixture
-def sweep_here(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> Callable[..., tuple[int, str, str]]:
+def sweep_here(call_command: RunCommand, monkeypatch: pytest.MonkeyPatch) -> RunCommand:
     """(*arguments) -> exit code, stdout and stderr of `xrgs-sweep`, run in this process."""
-    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sweep, "exit_on_signal", nullcontext)  # keep pytest's own signal handlers
-
-    def run(*arguments: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["xrgs-sweep", *arguments])
-        capsys.readouterr()
-        code, message = 0, ""
-        try:
-            sweep.main()
-        except SystemExit as end:
-            message = end.code if isinstance(end.code, str) else ""
-            code = 1 if message else int(end.code or 0)
-        out, err = capsys.readouterr()
-        return code, out, err + message
-
-    return run
+    return partial(call_command, "sweep")
 
 
 @dataclass
@@ -146,12 +132,18 @@ def children(monkeypatch: pytest.MonkeyPatch) -> Children:
 def swept(
     forked_command: RunCommand, made_once: Callable[..., Path], smoke_variants: Path
 ) -> tuple[Path, str]:
-    """A folder with a finished smoke sweep in its store `s`, and what was printed."""
+    """A folder with a finished smoke sweep in its store `s`, and what was printed.
+
+    The store's folder `cells` is a link.
+    """
 
     def sweep_once(folder: Path) -> None:
         shutil.copytree(smoke_variants, folder / "s" / "variants")
-        code, out, err = forked_command("sweep", folder, "+ablation=consistency", *SMOKE, "store=s")
+        (folder / "disk").mkdir()
+        (folder / "s" / "cells").symlink_to(folder / "disk")
+        code, out, err = forked_command("sweep", folder, *SWEEP)
         assert code == 0, err
+        assert err.count("training cell") == 2
         (folder / "printed").write_text(out, encoding="utf-8")
 
     folder = made_once("swept", sweep_once)

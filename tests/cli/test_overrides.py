@@ -336,6 +336,8 @@ def test_a_typo_is_one_line_with_what_was_meant(
 def test_an_override_that_hydra_s_grammar_refuses_is_answered_with_the_words_to_type(
     word: str, meant: str
 ) -> None:
+    if word.startswith("+ablation=") and ",," not in word:
+        assert with_quotes([word]) == [word]  # no files whose names have brackets, as `[a` and `b`
     with pytest.raises(XrgsError) as refused, explained():
         expand([word])
     assert str(refused.value).startswith(f"{word}: ")
@@ -379,13 +381,6 @@ def test_numbers_in_a_notation_of_people_are_answered_with_the_words_to_type(
         )
 
 
-@pytest.mark.parametrize(
-    "word", ["seed=3", "seed=-3", "train.optimizer.x=1e-3", "seed=${variant.seed}", "seed=0,1"]
-)
-def test_numbers_of_hydra_s_grammar_stay(word: str) -> None:
-    assert with_quotes([word]) == [word]
-
-
 def test_words_that_a_later_one_replaces_are_said(sweep_here: RunCommand) -> None:
     """As bash makes them of `seed={0..2}`; a word that is only repeated is no mistake."""
     said = "seed is given 3 times, and seed=2 replaces the others; for all of them write seed=0,1,2"
@@ -400,18 +395,6 @@ def test_words_that_a_later_one_replaces_are_said(sweep_here: RunCommand) -> Non
     assert (code, out) == (0, "")
     assert said in err.splitlines()
     assert err.count(" / seed ") == err.count(" / seed 2") == 1
-
-
-@pytest.mark.parametrize(
-    "word", ["+ablation=[a,b", "+ablation=(a,b", "+ablation=a,b]", "+ablation=a,b)", "scene=[a,b"]
-)
-def test_a_list_of_files_that_lacks_a_bracket_is_named_whole(word: str) -> None:
-    """It is not taken for files whose names have brackets, as `[a` and `b`."""
-    (quoted,) = with_quotes([word])
-    assert quoted == word
-    with pytest.raises(XrgsError, match=re.escape(f"{word}: ")) as refused, explained():
-        expand([quoted])
-    assert "; write " in str(refused.value)
 
 
 @pytest.mark.parametrize(
@@ -445,6 +428,8 @@ def test_no_message_has_the_words_of_a_parser(word: str, said: str) -> None:
         ("train.steps=1.5", "train.steps=1.5"),  # refused by its type
         ("train.validation=3e-1", "train.validation=3e-1"),  # no whole number
         ("scene.path=1e3", "scene.path='1e3'"),
+        *((word, word) for word in ("seed=3", "seed=-3", "seed=${variant.seed}", "seed=0,1")),
+        ("train.optimizer.x=1e-3", "train.optimizer.x=1e-3"),
     ],
 )
 def test_a_whole_number_may_be_written_in_any_way(word: str, read: str) -> None:

@@ -346,20 +346,14 @@ def test_ablations_stack_and_one_that_changes_nothing_is_named_in_the_plan(
     assert "consistency consistency.weight=0 changes nothing here" in err
 
 
-def test_a_comment_above_and_one_behind_a_value_are_shown() -> None:
+def test_keys_are_explained_by_the_comments_beside_them() -> None:
     above, behind = explain("train.steps"), explain("variant.hr_fraction")
     assert above.startswith("train.steps=30000\n  Number of steps, one view a step")
     assert behind.startswith("variant.hr_fraction=0.3\n  share of the training views that are HR")
     assert "train.views" not in above
     assert "--cfg job" in above
-
-
-def test_a_group_shows_its_keys() -> None:
-    found = explain("limits")
-    assert found.index("limits.minutes=0.0") < found.index("limits.memory_gb=0.0")
-
-
-def test_an_unknown_key_is_named_with_one_like_it() -> None:
+    group = explain("limits")
+    assert group.index("limits.minutes=0.0") < group.index("limits.memory_gb=0.0")
     with pytest.raises(
         XrgsError, match=r"help=stesp: there is no such key; did you mean train\.steps"
     ):

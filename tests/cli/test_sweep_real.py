@@ -7,19 +7,26 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import subprocess
 import sys
+import tarfile
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+
+from tests.cli.conftest import SMOKE, SWEEP
+from xrgs.mixture import variant
+from xrgs.safeio.records import read_table
+from xrgs.store.cell_folder import CellFolder
+from xrgs.store.store import Store
 
 pytestmark = pytest.mark.slow
 
 RunCommand = Callable[..., tuple[int, str, str]]
 SweepHere = RunCommand
 Contents = Callable[[Path], dict[str, str]]
-SMOKE = ("scene=motorcycle", "preset=smoke", "train.steps=8")
 
 
 def test_a_sweep_ends_with_the_table_and_keeps_all_that_a_reader_may_need(
@@ -78,7 +85,7 @@ def test_a_corrupt_cell_is_trained_again(
     before = contents(cell)
     scores = cell / "scores.csv"
     scores.write_text(scores.read_text().replace("0.", "0.9", 1))
-    code, _, err = forked_command("sweep", store.parent, "+ablation=consistency", *SMOKE, "store=s")
+    code, _, err = forked_command("sweep", store.parent, *SWEEP)
     assert code == 0
     assert "corrupt" in err
     assert "1 done" in err
@@ -117,3 +124,74 @@ def test_the_child_imports_the_package_of_its_parent_and_not_that_of_its_folder(
     )
     assert "WorkError: gone: another attempt at the cell has begun" in done.stderr
     assert "the wrong package" not in done.stderr
+
+
+def baseline(store: Store) -> CellFolder:
+    (found,) = [row.folder for row in store.cell_rows() if row.label == "baseline"]
+    return found
+
+
+def test_the_curves_of_each_cell_are_tracked(store: Path) -> None:
+    for cell in Store(store).cell_folders():
+        (file,) = (store / "tracking" / "csv").glob(f"*--{cell.id}.csv")
+        header, rows = read_table(file)
+        table = [dict(zip(header, row, strict=True)) for row in rows]
+        losses = [float(row["value"]) for row in table if row["series"] == "history/loss"]
+        assert losses == list(cell.history()["loss"])
+        assert {"score/psnr", "score/gaussians"} <= {row["series"] for row in table}
+
+
+def test_cells_on_another_disk_are_found_by_every_command(
+    swept: tuple[Path, str], forked_command: RunCommand, tmp_path: Path
+) -> None:
+    home, table = swept
+    folder = Path(shutil.copytree(home, tmp_path / "copy", symlinks=True))
+    assert (folder / "s" / "cells").is_symlink()
+    files = [file for file in (home / "disk").rglob("*") if file.is_file()]
+    written = {file: file.stat().st_mtime_ns for file in files}
+    code, again, err = forked_command("sweep", folder, *SWEEP)
+    assert code == 0, err
+    assert "plan: 2 cells, 2 done" in err
+    assert "training cell" not in err
+    assert again == table
+    assert {file: file.stat().st_mtime_ns for file in files} == written
+    code, listed, err = forked_command("store", folder, "list", "--store=s")
+    assert code == 0, err
+    assert listed.count("done") == 2
+    assert set(Store(folder / "s").cells()["state"]) == {"done"}
+    assert "Next:" in table
+
+
+def test_the_same_program_gives_the_same_bits(
+    forked_command: RunCommand, store: Path, tmp_path: Path
+) -> None:
+    original = baseline(Store(store)).path
+    before = {file: file.stat().st_mtime_ns for file in original.rglob("*")}
+    code, out, err = forked_command("sweep", tmp_path, f"rerun={original}", "out=again")
+    assert code == 0, out + err
+    assert out.startswith("the same, bit for bit: scores.csv, history.csv, splats.ply")
+    assert "code, libraries and machine are the same" in err
+    assert f"Written to {tmp_path / 'again'}" in out
+    assert (tmp_path / "again/splats.ply").read_bytes() == (original / "splats.ply").read_bytes()
+    assert {file: file.stat().st_mtime_ns for file in original.rglob("*")} == before
+
+
+def test_a_sweep_goes_on_from_a_packed_store(
+    forked_command: RunCommand, store: Path, tmp_path: Path
+) -> None:
+    cell = baseline(Store(store))
+    built, out = cell.identity().variant, tmp_path / "a.tar.xz"
+    packed = ("pack", cell.id, f"--store={store}", f"--out={out}")
+    assert forked_command("store", tmp_path, *packed)[0::2] == (0, "")
+    with tarfile.open(out) as archive:
+        archive.extractall(tmp_path / "other", filter="data")
+    other = Store((tmp_path / "other" / "xrgs-store").rename(tmp_path / "other" / "s"))
+    assert [path.name for path in other.variants.iterdir()] == [f"trimmed-{built}"]
+    code, table, err = forked_command("sweep", tmp_path / "other", *SWEEP)
+    assert code == 0
+    assert f"variant {built}: making the images again that xrgs-store trim has removed" in err
+    assert "building the mixed-resolution variant" not in err
+    assert err.count("training cell") == 1
+    assert "consistency" in table
+    assert [path.name for path in other.variants.glob("[!.]*")] == [built]
+    assert variant.verify(other.variants / built) == []

@@ -8,11 +8,11 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
-
-from tests import forks
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "arms"
 NAME = "skip_backward"
@@ -20,7 +20,7 @@ NAME = "skip_backward"
 
 @pytest.mark.slow
 def test_it_is_swept_and_trained_again_only_where_it_is_named(
-    tmp_path: Path, smoke_variants: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, smoke_variants: Path, forked_command: Callable[..., tuple[int, str, str]]
 ) -> None:
     # From a copy: pip may leave files in the folder that it builds.
     source, site = shutil.copytree(EXAMPLE, tmp_path / "arms"), tmp_path / "site"
@@ -30,32 +30,31 @@ def test_it_is_swept_and_trained_again_only_where_it_is_named(
     subprocess.run([*pip, *target, str(source)], check=True, capture_output=True)
     shutil.copytree(smoke_variants, tmp_path / "s" / "variants")
     path = os.pathsep.join(filter(None, [str(site), os.environ.get("PYTHONPATH", "")]))
-    monkeypatch.setenv("PYTHONPATH", path)
-    with forks.server() as run:
-        code, out, err = run(
-            *("sweep", tmp_path, "--config-dir", str(source / "conf"), f"+ablation={NAME}"),
-            *("scene=motorcycle", "preset=smoke", "train.steps=4", "threads=1", "store=s"),
-        )
-        assert code == 0, err
-        assert out.startswith(f"{NAME} against baseline")
-        (cell,) = (
-            file.parent
-            for file in (tmp_path / "s" / "cells").glob("*/identity.json")
-            if "plugins" in json.loads(file.read_text())["components"]
-        )
-        with (cell / "history.csv").open() as file:
-            *_, third, last = csv.DictReader(file)
-        # Two steps after densification, on views that had no such step before: none is skipped.
-        assert [{row[f"{NAME}.{tag}"] for tag in ("HR", "LR")} for row in (third, last)] == [
-            {"", "0.0"},
-            {"", "0.0"},
-        ]
-        # A store must not decide which installed package is imported.
-        rerun = ("sweep", tmp_path, f"rerun={cell}", "out=again")
-        code, _, err = run(*rerun)
-        assert code == 1
-        assert f"add plugins={NAME}" in err
-        assert not (tmp_path / "again").exists()
-        code, out, err = run(*rerun, f"plugins={NAME}")
-        assert code == 0, err
-        assert out.startswith("the same, bit for bit")
+    run = partial(forked_command, PYTHONPATH=path)
+    code, out, err = run(
+        *("sweep", tmp_path, "--config-dir", str(source / "conf"), f"+ablation={NAME}"),
+        *("scene=motorcycle", "preset=smoke", "train.steps=4", "threads=1", "store=s"),
+    )
+    assert code == 0, err
+    assert out.startswith(f"{NAME} against baseline")
+    (cell,) = (
+        file.parent
+        for file in (tmp_path / "s" / "cells").glob("*/identity.json")
+        if "plugins" in json.loads(file.read_text())["components"]
+    )
+    with (cell / "history.csv").open() as file:
+        *_, third, last = csv.DictReader(file)
+    # Two steps after densification, on views that had no such step before: none is skipped.
+    assert [{row[f"{NAME}.{tag}"] for tag in ("HR", "LR")} for row in (third, last)] == [
+        {"", "0.0"},
+        {"", "0.0"},
+    ]
+    # A store must not decide which installed package is imported.
+    rerun = ("sweep", tmp_path, f"rerun={cell}", "out=again")
+    code, _, err = run(*rerun)
+    assert code == 1
+    assert f"add plugins={NAME}" in err
+    assert not (tmp_path / "again").exists()
+    code, out, err = run(*rerun, f"plugins={NAME}")
+    assert code == 0, err
+    assert out.startswith("the same, bit for bit")

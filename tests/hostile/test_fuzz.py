@@ -326,8 +326,12 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PARSERS)
-def test_mutated_files_are_read_or_refused(store: Path, tmp_path: Path, name: str) -> None:
-    try_files(name, PARSERS[name], store, tmp_path, range(PARSERS[name].count))
+def test_mutated_and_cut_files_are_read_or_refused(store: Path, tmp_path: Path, name: str) -> None:
+    parser = PARSERS[name]
+    try_files(name, parser, store, tmp_path, range(parser.count))
+    valid = parser.valid(store)
+    cuts = range(0, len(valid), max(1, len(valid) // _MAX_CUTS))
+    try_contents(name, parser, store, tmp_path, ((f"cut {n}", valid[:n]) for n in cuts))
 
 
 @pytest.mark.slow
@@ -341,14 +345,6 @@ def test_a_parser_with_another_error_is_found(store: Path, tmp_path: Path) -> No
     careless = Parser(scene, mutate_json, lambda file: json.loads(file.read_bytes())["files"])
     with pytest.raises(AssertionError, match="seed"):
         try_files("scene.json", careless, store, tmp_path, range(100))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", PARSERS)
-def test_cut_files_are_read_or_refused(store: Path, tmp_path: Path, name: str) -> None:
-    valid = PARSERS[name].valid(store)
-    cuts = range(0, len(valid), max(1, len(valid) // _MAX_CUTS))
-    try_contents(name, PARSERS[name], store, tmp_path, ((f"cut {n}", valid[:n]) for n in cuts))
 
 
 def try_files(name: str, parser: Parser, store: Path, folder: Path, seeds: range) -> None:

@@ -4,7 +4,6 @@ import math
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
 from scipy import stats
 
@@ -360,31 +359,6 @@ def test_a_baseline_outside_the_sweep_is_refused(made: Any) -> None:
     made.add("consistency")
     with pytest.raises(ReportError, match=r"cell00000.*baseline .* is not in the sweep"):
         compared(made)
-
-
-def test_the_arithmetic_does_not_grow_faster_than_the_cells(made: Any) -> None:
-    """Ten thousand cells give the numbers that a plain loop gives."""
-    rng = np.random.default_rng(0)
-    n = 5000
-    scenes = [f"scene{number % 50}" for number in range(n)]
-    base = pd.DataFrame(
-        {
-            "scene": scenes, "condition": "", "label": "baseline", "seed": np.arange(n) // 50,
-            "cell_id": [f"b{number}" for number in range(n)], "variant_id": scenes,
-            "baseline_id": [f"b{number}" for number in range(n)], "error": None,
-            "state": "done", "reason": "", "protocol": 1, "variant_seed": 0, "validation": 0.0,
-            "machine": "",
-        }
-    )  # fmt: skip
-    names = [metric.name for metric in METRICS]
-    base[[f"{metric.name}_code" for metric in METRICS if metric.score]] = "code"
-    base[names] = rng.uniform(1, 2, (n, len(names)))
-    ablation = base.assign(label="a", cell_id=[f"a{number}" for number in range(n)])
-    ablation[names] = rng.uniform(1, 2, (n, len(names)))
-    comparison = compare(pd.concat([base, ablation], ignore_index=True), METRICS)
-    change = ablation["psnr"] - base["psnr"]
-    by_scene = [np.mean(change[np.array(scenes) == name]) for name in dict.fromkeys(scenes)]
-    assert mean_of(comparison, "psnr", "a")["change"] == pytest.approx(np.mean(by_scene))
 
 
 def test_cells_of_a_sweep_without_a_baseline_are_compared_with_that_of_a_joined_one(

@@ -137,14 +137,24 @@ def test_each_draw_of_a_variant_has_a_folder_of_its_own(
     assert rows["psnr"].iloc[0] - rows["psnr"].iloc[1] == pytest.approx(20 * np.log10(2), abs=0.01)
 
 
-def test_what_its_training_took_stands_in_the_row(
-    made: MakeStore, frozen_variant: Callable[..., str], tmp_path: Path
-) -> None:
+@pytest.fixture
+def join(made: MakeStore, frozen_variant: Callable[..., str]) -> Callable[..., pd.DataFrame]:
+    """(folder, label) -> the cells of a sweep of one cell, with the renders of a folder."""
     made.add(variant=frozen_variant())
-    sweep = made.read()
+
+    def joined(folder: Path, label: str = "other") -> pd.DataFrame:
+        sweep = made.read()
+        return with_external(sweep, ReportStore(made.store.path), [External(label, folder)]).cells
+
+    return joined
+
+
+def test_what_its_training_took_stands_in_the_row(
+    join: Callable[..., pd.DataFrame], tmp_path: Path
+) -> None:
     folder = rendered(tmp_path / "r")
     (folder / "figures.json").write_text('{"training_time_s": 61.5, "gaussians": 41230}')
-    row = with_external(sweep, ReportStore(made.store.path), [External("o", folder)]).cells.iloc[-1]
+    row = join(folder).iloc[-1]
     assert (row["training_time_s"], row["gaussians"]) == (61.5, 41230)
     assert pd.isna(row[["memory_bytes", "peak_rss_bytes", "evaluations"]]).all()
 
@@ -158,14 +168,12 @@ def test_what_its_training_took_stands_in_the_row(
     ],
 )
 def test_wrong_figures_are_refused(
-    made: MakeStore, frozen_variant: Callable[..., str], tmp_path: Path, content: str, why: str
+    join: Callable[..., pd.DataFrame], tmp_path: Path, content: str, why: str
 ) -> None:
-    made.add(variant=frozen_variant())
-    sweep = made.read()
     folder = rendered(tmp_path / "r")
     (folder / "figures.json").write_text(content)
     with pytest.raises(XrgsError, match=rf"{folder}/figures\.json: .*{why}"):
-        with_external(sweep, ReportStore(made.store.path), [External("o", folder)])
+        join(folder)
 
 
 @pytest.mark.parametrize(
@@ -177,48 +185,36 @@ def test_wrong_figures_are_refused(
     ],
 )
 def test_a_render_that_can_not_be_scored_is_named(
-    made: MakeStore,
-    frozen_variant: Callable[..., str],
+    join: Callable[..., pd.DataFrame],
     tmp_path: Path,
     size: tuple[int, int] | None,
     mode: str,
     why: str,
 ) -> None:
-    made.add(variant=frozen_variant())
     file = rendered(tmp_path / "renders") / f"{VIEWS[1]}.png"
     file.unlink()
     if size:
         Image.fromarray(noise(0, size)).convert(mode).save(file)
-    sweep, other = made.read(), External("gsplat", tmp_path / "renders")
     with pytest.raises(ReportError) as caught:
-        with_external(sweep, ReportStore(made.store.path), [other])
+        join(tmp_path / "renders")
     message = str(caught.value)
     assert message.startswith(str(file))
     assert why in message
     assert "expected is an 8-bit RGB PNG of 32 x 24 px, the render of the view IMG_009" in message
 
 
-def test_a_label_of_the_sweep_is_refused(
-    made: MakeStore, frozen_variant: Callable[..., str], tmp_path: Path
-) -> None:
-    made.add(variant=frozen_variant())
-    sweep = made.read()
+def test_a_label_of_the_sweep_is_refused(join: Callable[..., pd.DataFrame], tmp_path: Path) -> None:
     with pytest.raises(ReportError, match="external=baseline: cells of the sweep have that label"):
-        with_external(
-            sweep, ReportStore(made.store.path), [External("baseline", rendered(tmp_path / "r"))]
-        )
+        join(rendered(tmp_path / "r"), "baseline")
 
 
 def test_a_damaged_variant_is_no_truth(
-    made: MakeStore, frozen_variant: Callable[..., str], tmp_path: Path
+    made: MakeStore, join: Callable[..., pd.DataFrame], tmp_path: Path
 ) -> None:
-    variant = frozen_variant()
-    made.add(variant=variant)
-    sweep = made.read()
-    photograph = made.store.path / "variants" / variant / "images" / "test" / "IMG_001.png"
+    (photograph,) = made.store.variants.glob("*/images/test/IMG_001.png")
     shutil.copy(rendered(tmp_path / "r") / "IMG_001.png", photograph)
     with pytest.raises(saved_variant.CorruptVariant, match=r"IMG_001\.png"):
-        with_external(sweep, ReportStore(made.store.path), [External("gsplat", tmp_path / "r")])
+        join(tmp_path / "r")
 
 
 def test_folders_have_labels_or_their_own_names() -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import os
 from collections.abc import Callable, Mapping
 from copy import deepcopy
 from dataclasses import dataclass, replace
@@ -26,7 +24,9 @@ from xrgs.store.cell_folder import CellFolder
 from xrgs.store.identity import cell_id, cell_identity
 from xrgs.store.schema import RecordedCell
 from xrgs.store.store import Store
+from xrgs.sweep.axes import CellSpec
 from xrgs.sweep.job import SweepSession
+from xrgs.sweep.plan import PlannedCell
 from xrgs.sweep.study import Study
 
 #: The id of a variant that is not built.
@@ -39,6 +39,29 @@ SUMMARY = {
     "evaluations": 500,
     "steps": 20,
 }
+
+
+def content(folder: Path) -> dict[str, tuple[int, int, bytes]]:
+    """Inode, time and bytes of every file of a folder."""
+    files = [file for file in folder.rglob("*") if file.is_file()]
+    stats = {file: file.stat() for file in files}
+    return {
+        file.relative_to(folder).as_posix(): (stat.st_ino, stat.st_mtime_ns, file.read_bytes())
+        for file, stat in stats.items()
+    }
+
+
+def planned(conf: Conf, label: str, *shared: str) -> PlannedCell:
+    """A cell of the variant `v`."""
+    identity = cell_identity(conf, "v")
+    return PlannedCell(CellSpec(label, "", shared, ()), conf, "v", identity, cell_id(identity))
+
+
+def finish(store: Store, name: str) -> None:
+    """Write the least that a done cell has."""
+    cell = store.cell(name)
+    (cell.path / "scores.csv").write_text("view\na\n")
+    cell.finish(["a"], {})
 
 
 @pytest.fixture
@@ -105,33 +128,6 @@ def cells(compose: Callable[..., Conf], store: Store) -> Cells:
     """The cells of `store`, of a config on the torch backend."""
     given = ("scene=motorcycle", "splat.backend=torch", f"store={store.path}", "threads=1")
     return Cells(store, compose(*given))
-
-
-@pytest.fixture
-def sick(monkeypatch: pytest.MonkeyPatch) -> Callable[[str, int], None]:
-    """(end of a path, number of an error) -> files with that end can't be read from now on.
-
-    The number 0 makes all files readable again.
-    """
-    opened, opened_io = os.open, io.open
-
-    def sicken(end: str, number: int) -> None:
-        def check(path: object) -> None:
-            if number and isinstance(path, (str, Path)) and str(path).endswith(end):
-                raise OSError(number, os.strerror(number), str(path))
-
-        def os_open(path: Any, *given: Any, **named: Any) -> int:
-            check(path)
-            return opened(path, *given, **named)
-
-        def io_open(path: Any, *given: Any, **named: Any) -> Any:
-            check(path)
-            return opened_io(path, *given, **named)
-
-        monkeypatch.setattr(os, "open", os_open)
-        monkeypatch.setattr(io, "open", io_open)
-
-    return sicken
 
 
 @cache

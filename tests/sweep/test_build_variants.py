@@ -186,13 +186,13 @@ def test_a_variant_that_can_not_be_read_now_is_not_built_anew(
     conf: Conf,
     store: Store,
     monkeypatch: pytest.MonkeyPatch,
-    sick: Callable[[str, int], None],
+    unreadable: Callable[..., None],
 ) -> None:
     frozen = store.variants / f"{variant.key(conf.scene, conf.variant)}-0123456789abcdef"
     frozen.mkdir()
     (frozen / "variant.json").write_text("{}")
     monkeypatch.setattr(job, "run_in_child", unexpected)
-    sick("variant.json", errno.ESTALE)
+    unreadable("variant.json", errno.ESTALE)
     found = plan(conf, store, allow_build=True)
     assert found == PlannedVariant(error=found.error)
     assert f"{frozen}/variant.json: {os.strerror(errno.ESTALE)}" in str(found.error)

@@ -12,9 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.sweep.conftest import VARIANT, content
 from xrgs.config import Conf
-from xrgs.mixture import variant
-from xrgs.mixture.views import Variant
 from xrgs.safeio.atomic import write_json
 from xrgs.splat.backend import resolve_backend
 from xrgs.store.attempts import begin_attempt, plan_cell
@@ -42,37 +41,30 @@ job.main("cell", *sys.argv[1:])
 
 
 @pytest.fixture
-def built(smoke_variants: Path) -> Variant:
-    """The cell's variant."""
-    (folder,) = smoke_variants.iterdir()
-    return variant.load(folder)
+def begin(compose: Callable[..., Conf], tmp_path: Path) -> Callable[[str], CellFolder]:
+    """(variant) -> a begun cell of two steps, which writes a checkpoint after each of them."""
 
+    def begun(variant_id: str) -> CellFolder:
+        changes = ("scene=motorcycle", "preset=smoke", "train.steps=2", "threads=1")
+        conf = compose(*changes, "checkpoint_s=1e-9")
+        conf.splat.backend = resolve_backend(conf.splat.backend)
+        store = Store(tmp_path / "s")
+        store.prepare()
+        cell = store.cell("c")
+        plan_cell(cell, conf, cell_identity(conf, variant_id))
+        begin_attempt(cell)
+        return cell
 
-@pytest.fixture
-def cell(compose: Callable[..., Conf], built: Variant, tmp_path: Path) -> CellFolder:
-    """A cell of which an attempt has begun; it writes a checkpoint after each of two steps."""
-    changes = ("scene=motorcycle", "preset=smoke", "train.steps=2", "threads=1")
-    conf = compose(*changes, "checkpoint_s=1e-9")
-    conf.splat.backend = resolve_backend(conf.splat.backend)
-    store = Store(tmp_path / "s")
-    store.prepare()
-    cell = store.cell("c")
-    plan_cell(cell, conf, cell_identity(conf, built.id))
-    begin_attempt(cell)
-    return cell
-
-
-def files(folder: Path) -> dict[str, tuple[int, bytes]]:
-    """Time and content of every file."""
-    found = [file for file in folder.rglob("*") if file.is_file()]
-    return {file.name: (file.stat().st_mtime_ns, file.read_bytes()) for file in found}
+    return begun
 
 
 @pytest.mark.slow
 def test_a_worker_that_wakes_up_after_a_takeover_writes_into_its_own_folder_alone(
-    cell: CellFolder, built: Variant, tmp_path: Path
+    begin: Callable[[str], CellFolder], smoke_variants: Path, tmp_path: Path
 ) -> None:
-    write_json(tmp_path / "request", job.cell_request(built.folder, cell))
+    (built,) = smoke_variants.iterdir()
+    cell = begin(built.name)
+    write_json(tmp_path / "request", job.cell_request(built, cell))
     arguments = [str(tmp_path / "request"), str(tmp_path / "answer")]
     child = subprocess.Popen([sys.executable, "-P", "-c", STOPPED, *arguments])
     assert os.WIFSTOPPED(os.waitpid(child.pid, os.WUNTRACED)[1])
@@ -83,25 +75,26 @@ def test_a_worker_that_wakes_up_after_a_takeover_writes_into_its_own_folder_alon
     begin_attempt(cell)
     (cell.path / "scores.csv").write_text("view\na\n")
     cell.finish(["a"], {})
-    before = files(cell.path)
+    before = content(cell.path)
     child.send_signal(signal.SIGCONT)
     child.wait(60)
-    assert files(cell.path) == before
+    assert content(cell.path) == before
     assert cell.state().name == "done"
     assert CellFolder(own).state().name == "done"  # where nobody looks any more
 
 
 def test_a_worker_that_starts_after_a_takeover_does_nothing(
-    cell: CellFolder, built: Variant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    begin: Callable[[str], CellFolder], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its parent was suspended between the beginning of the cell and the start of this worker."""
+    cell = begin(VARIANT)
     monkeypatch.chdir(tmp_path)  # which is left at the end
-    request = job.cell_request(built.folder, cell)
+    request = job.cell_request(tmp_path / VARIANT, cell)
     begin_attempt(cell)
-    before = files(cell.path)
+    before = content(cell.path)
     for _ in range(2):  # another folder has its name, and then none
         with pytest.raises(job.WorkError, match="another attempt at the cell has begun"):
             job._WORK["cell"](request)
-        assert files(cell.path) == before
+        assert content(cell.path) == before
         shutil.rmtree(cell.path, ignore_errors=True)
         before = {}

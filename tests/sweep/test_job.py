@@ -16,6 +16,7 @@ import pytest
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
+from tests.sweep.conftest import content
 from xrgs.errors import XrgsError
 from xrgs.mixture import variant
 from xrgs.photos import scenes
@@ -217,13 +218,6 @@ def test_a_cell_ends_with_its_sweep_and_is_unfinished(
     assert later.state().name == "planned"  # no further job has begun
 
 
-def content(folder: Path) -> dict[str, tuple[int, int, bytes]]:
-    """Inode, time and bytes of every file of a folder."""
-    files = [file for file in folder.rglob("*") if file.is_file()]
-    stats = {file: file.stat() for file in files}
-    return {f.name: (s.st_ino, s.st_mtime_ns, f.read_bytes()) for f, s in stats.items()}
-
-
 def take_over(store: Store, cell_id: str) -> None:
     """Do what a sweep on another machine does that took this process for dead."""
     successor = store.leases / f"{cell_id}.1"
@@ -276,7 +270,7 @@ def test_a_job_whose_lease_was_taken_over_writes_nothing_from_then_on(
 def test_a_cell_whose_status_can_not_be_read_is_left_as_it_is(
     session: SweepSession,
     cells: Cells,
-    sick: Callable[[str, int], None],
+    unreadable: Callable[..., None],
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -290,19 +284,19 @@ def test_a_cell_whose_status_can_not_be_read_is_left_as_it_is(
     assert run(session, cells, cell.id) == "done"
     before = content(cells.store.path / "cells")
     for file, number in (("status.json", errno.EACCES), ("scores.csv", errno.ESTALE)):
-        sick(file, number)
+        unreadable(file, number)
         assert run(session, cells, cell.id) == "failed"
         err = capsys.readouterr().err
         assert file in err
         assert os.strerror(number) in err
-        sick("", 0)
+        unreadable("", 0)
     assert content(cells.store.path / "cells") == before
     assert not session.stopped
     other = cells.plan(seed=1)
 
     def die_on_a_sick_disk(*_: object) -> None:
         (other.path / "status.json").write_text('{"state": "done"}')
-        sick("status.json", errno.EIO)
+        unreadable("status.json", errno.EIO)
         raise WorkError("it raised")
 
     monkeypatch.setattr(job_module, "run_in_child", die_on_a_sick_disk)

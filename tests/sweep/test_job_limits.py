@@ -39,7 +39,7 @@ time.sleep(600)
 _HUNGRY = """
 import time
 eaten = []
-for _ in range(100):
+for _ in range(40):
     eaten.append(b"x" * 10_000_000)
     time.sleep(0.02)
 """

@@ -16,7 +16,7 @@ from hydra.core.utils import JobReturn, JobStatus
 from hydra.types import HydraContext
 from omegaconf import DictConfig, OmegaConf
 
-from tests.sweep.conftest import hydra_config
+from tests.sweep.conftest import finish, hydra_config, planned
 from xrgs import config
 from xrgs.cli.overrides import with_quotes
 from xrgs.errors import XrgsError
@@ -25,10 +25,8 @@ from xrgs.store.attempts import begin_attempt
 from xrgs.store.identity import cell_id, cell_identity
 from xrgs.store.store import Store
 from xrgs.sweep import study
-from xrgs.sweep.axes import CellSpec
 from xrgs.sweep.job import INTERRUPTED, SweepSession
 from xrgs.sweep.launchers import capacity, check, one_cell_a_gpu
-from xrgs.sweep.plan import PlannedCell
 from xrgs.sweep.study import LOST, Launches
 
 
@@ -192,18 +190,6 @@ class FakeLauncher:
             shutil.rmtree(self.store.cell(self.ids[name]).path)
             return JobReturn(status=JobStatus.FAILED, _return_value=RuntimeError("no variant"))
         return JobReturn(status=JobStatus.COMPLETED, _return_value="done")
-
-
-def planned(conf: config.Conf, label: str) -> PlannedCell:
-    """Return a cell whose variant is `v`."""
-    identity = cell_identity(conf, "v")
-    return PlannedCell(CellSpec(label, "", (), ()), conf, "v", identity, cell_id(identity))
-
-
-def finish(store: Store, name: str) -> None:
-    cell = store.cell(name)
-    (cell.path / "scores.csv").write_text("view\na\n")
-    cell.finish(["a"], {})
 
 
 @pytest.fixture

@@ -238,7 +238,7 @@ def test_a_terminal_shows_one_line_which_is_removed_at_the_end(
 
 
 def test_what_can_not_be_read_now_is_read_again(
-    watched: Watched, sick: Callable[[str, int], None]
+    watched: Watched, unreadable: Callable[..., None]
 ) -> None:
     monitor = SweepMonitor(watched.store.cells_folder)
     monitor.watch([watched.plan("a"), watched.plan("b")])
@@ -248,9 +248,9 @@ def test_what_can_not_be_read_now_is_read_again(
     gone.rename(watched.store.path)
     watched.begin("a")
     watched.finish("a")
-    sick("status.json", errno.EIO)
+    unreadable("status.json", errno.EIO)
     assert str(monitor.snapshot()) == "0 of 2 cells done"
-    sick("", 0)
+    unreadable("", 0)
     assert str(monitor.snapshot()) == "1 of 2 cells done"
     watched.store.path.rename(gone)
     assert str(monitor.snapshot()) == "1 of 2 cells done"  # it was seen to end

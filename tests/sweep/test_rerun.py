@@ -244,10 +244,10 @@ def test_a_folder_that_can_not_be_rerun_is_refused_with_a_reason(
 
 @pytest.mark.parametrize("name", ["status.json", "splats.ply"])
 def test_a_file_that_can_not_be_read_now_is_named(
-    cell: CellFolder, train: Callable[..., None], sick: Callable[[str, int], None], name: str
+    cell: CellFolder, train: Callable[..., None], unreadable: Callable[..., None], name: str
 ) -> None:
     train()
-    sick(f"{cell.id}/{name}", errno.EIO)
+    unreadable(f"{cell.id}/{name}", errno.EIO)
     with pytest.raises(XrgsError, match=os.strerror(errno.EIO)) as caught:
         rerun(cell.path)
     assert f"{cell.id}/{name}" in str(caught.value)

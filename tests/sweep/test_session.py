@@ -41,12 +41,12 @@ def test_a_session_whose_folder_is_gone_is_over_and_does_not_reappear(
 
 
 def test_a_reason_that_can_not_be_read_now_stops_nothing(
-    session: SweepSession, sick: Callable[[str, int], None]
+    session: SweepSession, unreadable: Callable[..., None]
 ) -> None:
     session.stop("enough\x1b[31m\nof it")
-    sick("stopped", errno.EIO)
+    unreadable("stopped", errno.EIO)
     assert str(session.stopped) == ""
-    sick("", 0)
+    unreadable("", 0)
     assert str(session.stopped) == "enough [31m of it"
 
 

@@ -103,10 +103,10 @@ def intact(store: Store) -> Store:
 
 
 def test_a_cell_that_cannot_be_read_now_is_listed_with_the_reason(
-    intact: Store, sick: Callable[[str, int], None], monkeypatch: pytest.MonkeyPatch
+    intact: Store, unreadable: Callable[..., None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     number = errno.ESTALE
-    sick("status.json", number)
+    unreadable("status.json", number)
     assert {cell.state.name for cell in intact.cell_rows()} == {"failed"}
     text = describe(intact.path)
     assert "\nfailed:\n" in text
@@ -165,19 +165,6 @@ def test_what_is_no_cell_is_named(intact: Store) -> None:
             describe(path)
 
 
-@pytest.mark.slow
-def test_it_writes_nothing_and_needs_no_torch(
-    run_command: Callable[..., tuple[int, str, str]], store: Store, tmp_path: Path
-) -> None:
-    (tmp_path / "torch.py").write_text("raise ImportError('torch was imported')")
-    before = sorted(store.path.rglob("*"))
-    path = f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}"
-    code, out, err = run_command("status", tmp_path, "--store=s", PYTHONPATH=path)
-    assert code == 0, err
-    assert "7 cells" in out
-    assert sorted(store.path.rglob("*")) == before
-
-
 def test_names_of_a_store_are_not_obeyed_and_stay_on_their_lines(store: Store, cells: Any) -> None:
     code = identity.training_code("torch") | {"x\x1b]0;t\x07\nstale: no cells": "0"}
     cells.done("evil", {"code": code})
@@ -192,7 +179,11 @@ def test_names_of_a_store_are_not_obeyed_and_stay_on_their_lines(store: Store, c
 
 
 @pytest.mark.slow
-def test_a_watch_shows_the_cells_in_training_until_ctrl_c_and_changes_nothing(store: Store) -> None:
+def test_a_watch_shows_the_cells_in_training_until_ctrl_c_and_changes_nothing(
+    store: Store, tmp_path: Path
+) -> None:
+    """It needs no torch."""
+
     def files() -> dict[str, int]:
         return {name: status.st_mtime_ns for name, status in walk_files(store.path)}
 
@@ -206,8 +197,13 @@ def test_a_watch_shows_the_cells_in_training_until_ctrl_c_and_changes_nothing(st
     before = files()
     reader, writer = pty.openpty()
     command = [sys.executable, "-P", "-c", "from xrgs.cli.status import main; main()"]
+    (tmp_path / "torch.py").write_text("raise ImportError('torch was imported')")
+    path = f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}"
     watch = subprocess.Popen(
-        [*command, "--store", str(store.path), "--watch"], stdout=writer, stderr=writer
+        [*command, "--store", str(store.path), "--watch"],
+        env=os.environ | {"PYTHONPATH": path},
+        stdout=writer,
+        stderr=writer,
     )
     os.close(writer)
     shown = b""

@@ -5,8 +5,6 @@ from __future__ import annotations
 import errno
 import os
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,17 +17,17 @@ from hydra.errors import CompactHydraException
 from omegaconf import DictConfig
 
 from tests.conftest import composed_by_hydra
+from tests.sweep.conftest import content, finish, planned
 from xrgs import config
 from xrgs.errors import XrgsError
 from xrgs.evaluation.lpips import download, weights
 from xrgs.photos import scenes
 from xrgs.store.attempts import begin_attempt
-from xrgs.store.identity import cell_id, cell_identity
+from xrgs.store.identity import cell_id
 from xrgs.store.store import BASELINE, Store
 from xrgs.sweep import build_variants
 from xrgs.sweep import plan as plan_module
 from xrgs.sweep import study as study_module
-from xrgs.sweep.axes import CellSpec
 from xrgs.sweep.job import FAIL_FAST, STOPPED, STORE_FULL, SweepSession
 from xrgs.sweep.monitor import SweepMonitor
 from xrgs.sweep.plan import PlannedCell, describe, record
@@ -58,13 +56,6 @@ class Launcher:
         return [raised, *[stopped] * (len(jobs) - 1)]
 
 
-def planned_cell(conf: config.Conf, seed: int) -> PlannedCell:
-    """A cell of the variant `v`."""
-    identity = cell_identity(conf, "v")
-    spec = CellSpec(BASELINE, "", (f"seed={seed}",), ())
-    return PlannedCell(spec, conf, "v", identity, cell_id(identity))
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("reason", "fail_fast", "said"),
@@ -83,7 +74,7 @@ def test_a_sweep_that_starts_nothing_more_says_why(
     store.prepare()
     monkeypatch.setattr(Plugins, "instantiate_launcher", launcher.configured)
     conf = replace(compose("store=s"), fail_fast=fail_fast)
-    plan = [planned_cell(replace(conf, seed=seed), seed) for seed in range(3)]
+    plan = [planned(replace(conf, seed=seed), BASELINE, f"seed={seed}") for seed in range(3)]
     with SweepMonitor(store.cells_folder) as monitor:
         final = study("store=s")._run_until_complete(plan, store, [monitor])
     assert [cell.state.name for cell in final] == ["planned"] * 3
@@ -175,6 +166,12 @@ def test_a_condition_says_where_scores_are_of_the_training_views(
     assert {row.condition for row in record(plan)} == conditions
 
 
+def train(store: Store, name: str) -> None:
+    store.cell(name).path.mkdir(exist_ok=True)
+    begin_attempt(store.cell(name))
+    finish(store, name)
+
+
 class Trainer:
     """A launcher whose jobs finish their cells."""
 
@@ -188,26 +185,12 @@ class Trainer:
     def launch(self, jobs: Sequence[Sequence[str]], _: int) -> list[JobReturn]:
         for job in (overrides[0] for overrides in jobs):
             self.launched.append(job.removeprefix("cell="))
-            finish(self.store, self.launched[-1])
+            train(self.store, self.launched[-1])
         return [JobReturn(status=JobStatus.COMPLETED, _return_value="done") for _ in jobs]
 
 
-def finish(store: Store, name: str) -> None:
-    cell = store.cell(name)
-    cell.path.mkdir(exist_ok=True)
-    begin_attempt(cell)
-    (cell.path / "scores.csv").write_text("view\na\n")
-    cell.finish(["a"], {})
-
-
-def files(folder: Path) -> dict[Path, tuple[int, int]]:
-    """Inode and time of everything in a folder."""
-    stats = {file: file.stat() for file in folder.rglob("*")}
-    return {file: (stat.st_ino, stat.st_mtime_ns) for file, stat in stats.items()}
-
-
 @pytest.fixture
-def planned(
+def two_planned(
     compose: Callable[..., config.Conf], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> tuple[Store, Trainer, list[PlannedCell]]:
     """A store in which the first of two cells is done, a launcher, and the plan of both."""
@@ -217,20 +200,20 @@ def planned(
     monkeypatch.setattr(Plugins, "instantiate_launcher", trainer.configured)
     monkeypatch.setattr(study_module, "_POLL_S", 0.0)
     conf = compose("store=s", "splat.backend=torch")
-    plan = [planned_cell(replace(conf, seed=seed), seed) for seed in (0, 1)]
-    finish(store, str(plan[0].cell_id))
+    plan = [planned(replace(conf, seed=seed), BASELINE, f"seed={seed}") for seed in (0, 1)]
+    train(store, str(plan[0].cell_id))
     return store, trainer, plan
 
 
 def test_a_cell_that_can_not_be_read_fails_and_the_others_are_trained(
-    planned: tuple[Store, Trainer, list[PlannedCell]],
+    two_planned: tuple[Store, Trainer, list[PlannedCell]],
     study: Callable[..., Study],
-    sick: Callable[[str, int], None],
+    unreadable: Callable[..., None],
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    store, trainer, plan = planned
-    before = files(store.cell(str(plan[0].cell_id)).path)
-    sick(f"{plan[0].cell_id}/status.json", errno.EIO)
+    store, trainer, plan = two_planned
+    before = content(store.cell(str(plan[0].cell_id)).path)
+    unreadable(f"{plan[0].cell_id}/status.json", errno.EIO)
     with SweepMonitor(store.cells_folder) as monitor:
         made = study("store=s")
         plan = made._identified(plan, store)
@@ -241,15 +224,15 @@ def test_a_cell_that_can_not_be_read_fails_and_the_others_are_trained(
     assert f"{plan[0].cell_id}/status.json: {os.strerror(errno.EIO)}" in text
     assert "retry=failed" in text
     assert [row.error for row in record(final)] == [None, None]
-    sick("", 0)
-    assert files(store.cell(str(plan[0].cell_id)).path) == before
+    unreadable("", 0)
+    assert content(store.cell(str(plan[0].cell_id)).path) == before
     assert "1 of 2 cells done, 1 failed" in capsys.readouterr().err
 
 
 def test_the_notes_of_a_variant_are_given_once_for_all_of_its_cells(
-    planned: tuple[Store, Trainer, list[PlannedCell]], monkeypatch: pytest.MonkeyPatch
+    two_planned: tuple[Store, Trainer, list[PlannedCell]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    store, _, plan = planned
+    store, _, plan = two_planned
     found = build_variants.PlannedVariant("v", notes=("icon.png left out", "not placed: IMG_1"))
     monkeypatch.setattr(build_variants, "plan", lambda confs, *_, **__: [found] * len(confs))
     _, notes = plan_module.with_variants(plan, store, allow_build=True)
@@ -258,17 +241,17 @@ def test_the_notes_of_a_variant_are_given_once_for_all_of_its_cells(
 
 
 def test_a_count_that_can_not_be_read_fails_the_cell(
-    planned: tuple[Store, Trainer, list[PlannedCell]],
+    two_planned: tuple[Store, Trainer, list[PlannedCell]],
     study: Callable[..., Study],
-    sick: Callable[[str, int], None],
+    unreadable: Callable[..., None],
     compose: Callable[..., config.Conf],
 ) -> None:
-    store, _, (reference, _) = planned
+    store, _, (reference, _) = two_planned
     control = ("+ablation=count_matched", f"matched_to={BASELINE}")
     cell = PlannedCell(reference.spec, compose(*control), "v")
     assert cell.reference is not None
     done = replace(reference, state=store.cell(str(reference.cell_id)).state())
-    sick("summary.json", errno.EIO)
+    unreadable("summary.json", errno.EIO)
     waiting = study("store=s")._with_count(cell, {cell.reference: done}, store)
     assert "summary.json" in str(waiting.error)
     assert waiting.conf == cell.conf
@@ -278,14 +261,14 @@ def test_a_count_that_can_not_be_read_fails_the_cell(
 
 @pytest.mark.parametrize("how", ["deleted", "unmounted"])
 def test_a_store_that_vanishes_ends_the_study_with_one_line(
-    planned: tuple[Store, Trainer, list[PlannedCell]],
+    two_planned: tuple[Store, Trainer, list[PlannedCell]],
     study: Callable[..., Study],
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     tmp_path: Path,
     how: str,
 ) -> None:
-    store, trainer, plan = planned
+    store, trainer, plan = two_planned
 
     def launch(jobs: Sequence[Sequence[str]], _: int) -> list[JobReturn]:
         store.path.rename(tmp_path / "moved")
@@ -389,16 +372,3 @@ def test_the_weights_are_fetched_once_unless_it_is_a_dry_run_or_switched_off(
     provide_lpips(fetch=True, dry_run=False)
     assert capsys.readouterr().err == ""
     assert len(fetched) == 1
-
-
-@pytest.mark.slow
-def test_what_a_report_takes_seconds_to_import_is_imported_in_advance() -> None:
-    script = (
-        "import sys\n"
-        "from xrgs.sweep import study\n"
-        "slow = {'matplotlib.figure', 'pandas', 'torch'}\n"
-        "assert not slow & sys.modules.keys()\n"
-        "study._import_report()\n"
-        "assert slow <= sys.modules.keys()\n"
-    )
-    subprocess.run([sys.executable, "-P", "-c", script], check=True)
