@@ -17,7 +17,8 @@ from typing import TypeVar
 
 import psutil
 
-_In, _Out = TypeVar("_In"), TypeVar("_Out")
+_In = TypeVar("_In")
+_Out = TypeVar("_Out")
 
 
 def usable_cores() -> int:
