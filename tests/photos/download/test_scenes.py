@@ -144,7 +144,6 @@ def test_a_folder_in_the_way_is_left_alone(
         (["download", "llff", "ferm"], "fern"),
         (["download", "llff", "fern", "--url=ftp://x"], "ftp://x"),
         (["lpips", "--from", "gone"], "gone"),
-        (["inspect"], "scene=NAME"),
         (["inspect", "scene=nope"], "scene=nope"),
     ],
     ids=str,
