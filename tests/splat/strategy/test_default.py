@@ -141,3 +141,14 @@ def test_a_run_of_3000_steps_is_gsplats() -> None:
     # The run went through every rule, many times.
     assert total.pop("pruned_non_finite") == 0
     assert all(n > 50 for n in total.values()), total
+
+
+def test_gsplat_153_itself_never_resets() -> None:
+    """The one difference from the release that is our oracle: were it gone, so would this be."""
+    rng = np.random.default_rng(0)
+    values = random_start(20, rng)
+    theirs = Theirs(values, DensifySettings(start=5000, resets=False), 0)
+    theirs.descend(random_start(20, rng))
+    before = theirs.params["opacities"].detach().clone()
+    theirs.densify(3000, random_view(20, rng))
+    assert torch.equal(theirs.params["opacities"], before)
