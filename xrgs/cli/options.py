@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from dataclasses import is_dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias, get_type_hints
+from typing import Annotated, Any, TypeAlias, TypeVar, get_type_hints
 
 import tyro
 from tyro.conf import (
@@ -58,19 +58,20 @@ _CONFIG = (
     OmitArgPrefixes,  # --scenes, not --which.scenes, for an option in a dataclass
 )
 _REGISTRY = ConstructorRegistry()
+_Value = TypeVar("_Value")
 
 
 @_REGISTRY.primitive_rule
 def _path(kind: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Path] | None:
     """Read a path, and expand `~`, which shells don't expand in `--out=~/a`."""
-    if kind.type is not Path:
-        return None
-    return PrimitiveConstructorSpec(
-        nargs=1,
-        metavar="PATH",
-        instance_from_str=lambda words: _given_path(words[0]),
-        is_instance=lambda value: isinstance(value, Path),
-        str_from_instance=lambda path: [str(path)],
+    return _one_word(Path, "PATH", _given_path) if kind.type is Path else None
+
+
+@_REGISTRY.primitive_rule
+def _text(kind: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[str] | None:
+    """Read a text that is not empty."""
+    return (
+        _one_word(str, "TEXT", lambda word: _given_texts([word])[0]) if kind.type is str else None
     )
 
 
@@ -89,17 +90,15 @@ def _texts(kind: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[tuple[str, ...]]
     )
 
 
-@_REGISTRY.primitive_rule
-def _text(kind: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[str] | None:
-    """Read a text that is not empty."""
-    if kind.type is not str:
-        return None
+def _one_word(
+    kind: type[_Value], metavar: str, read: Callable[[str], _Value]
+) -> PrimitiveConstructorSpec[_Value]:
     return PrimitiveConstructorSpec(
         nargs=1,
-        metavar="TEXT",
-        instance_from_str=lambda words: _given_texts(words)[0],
-        is_instance=lambda value: isinstance(value, str),
-        str_from_instance=lambda text: [text],
+        metavar=metavar,
+        instance_from_str=lambda words: read(words[0]),
+        is_instance=lambda value: isinstance(value, kind),
+        str_from_instance=lambda value: [str(value)],
     )
 
 
