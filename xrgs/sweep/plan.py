@@ -131,10 +131,12 @@ def check_plugins(confs: Iterable[Conf], *, imported: bool) -> None:
 
     With `imported`, those that can't be imported, or don't take their settings, are refused too.
     """
-    used: list[tuple[str, Mapping[str, object]]] = []
-    for conf in confs:
-        used += [item for item in conf.components.plugins.items() if item not in used]
-    for name, settings in used:
+    used = {
+        (name, repr(settings)): settings
+        for conf in confs
+        for name, settings in conf.components.plugins.items()
+    }
+    for (name, _), settings in used.items():
         plugins.find(name)
         if imported:
             plugins.check(name, settings)
