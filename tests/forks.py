@@ -41,8 +41,8 @@ LIBRARIES = (
 MODULES = (
     *(f"xrgs.cli.{name}" for name in ("bench", "render", "report", "status", "store", "sweep")),
     *("xrgs.mixture.sfm", "xrgs.bench.run", "xrgs.store.cell", "xrgs.report", "xrgs.sweep.rerun"),
-    *("xrgs.viewer.film", "xrgs.viewer.trained", "kornia.losses"),
-    "matplotlib.backends.backend_agg",
+    *("xrgs.viewer.film", "xrgs.viewer.trained"),
+    *LIBRARIES,
 )
 
 
