@@ -7,7 +7,7 @@
 # Behaviour: where a project has an initial calibration, from a file or from an earlier project, the focal length,
 #            centre and distortion of transforms.json are the initial ones, beside the adjusted poses. A file without
 #            it is read rightly.
-# Guess:     (before the run) the adjusted calibration, which belongs to the poses.
+# Guess:     (the issue was read before the run) the adjusted calibration, which belongs to the poses.
 # Matters:   all views are scaled and bent by the correction that the adjustment had made: 65 px at the border for 3 %
 #            of the focal length.
 # Seen:      initial 3000, adjusted 3100: fl_x 3000.0; adjusted only: 3100.0

@@ -6,7 +6,7 @@
 #            where OpenCV has p2 (r2 + 2 x2) + 2 p1 x y.
 # Behaviour: the camera of transforms.json has the tangential terms of x in y and of y in x. b1 and b2, the different
 #            scale of x and the skew, are left out.
-# Guess:     (before the run) a point is projected to Metashape's pixel.
+# Guess:     (the issue was read before the run) a point is projected to Metashape's pixel.
 # Matters:   photographs bend by up to 26 px towards a corner, in all views alike: blur and floaters there, which a
 #            comparison of methods takes for their own.
 # Seen:      a calibration of a drone's camera of 8192x5460, p1 = -0.0013, p2 = 0.0008: up to 25.7 px off, 0.0 px with
