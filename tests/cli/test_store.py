@@ -8,13 +8,11 @@ import subprocess
 import sys
 import tarfile
 from collections.abc import Callable
-from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 
 from tests.cli.conftest import finish
-from xrgs.cli import store as command
 from xrgs.config import Conf
 from xrgs.store.attempts import begin_attempt, plan_cell
 from xrgs.store.cell_folder import CellFolder
@@ -40,14 +38,8 @@ def begun(tmp_path: Path, compose: Callable[..., Conf]) -> Callable[[str, int], 
 
 
 @pytest.fixture
-def xrgs_store(
-    call_command: Call,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    begun: Callable[[str, int], CellFolder],
-) -> Call:
+def xrgs_store(call_command: Call, tmp_path: Path, begun: Callable[[str, int], CellFolder]) -> Call:
     """(*arguments) -> exit code, stdout and stderr of `xrgs-store` on a store of two cells."""
-    monkeypatch.setattr(command, "exit_on_signal", nullcontext)  # keep pytest's own handlers
     store = Store(tmp_path / "s")
     store.prepare()
     for name, steps in (("abc", 3), ("abd", 4)):
