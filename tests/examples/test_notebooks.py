@@ -85,11 +85,12 @@ def test_photographs_are_trained(
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("here")
 def test_two_recipes_are_compared_and_filmed(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     smoke_variants: Path,
-    forked_command: Callable[..., tuple[int, str, str]],
+    call_command: Callable[..., tuple[int, str, str]],
 ) -> None:
     shutil.copytree(smoke_variants, tmp_path / "xrgs-store" / "variants")
     monkeypatch.chdir(tmp_path)
@@ -98,7 +99,7 @@ def test_two_recipes_are_compared_and_filmed(
     def system(line: str) -> None:
         name, *arguments = shlex.split(line)
         commands.append(name)
-        code, _, err = forked_command(name.removeprefix("xrgs-"), tmp_path, *arguments)
+        code, _, err = call_command(name.removeprefix("xrgs-"), *arguments)
         assert code == 0, err
 
     smaller = {"preset=smoke": "preset=smoke train.steps=20", "views 12": "views 2"}

@@ -12,6 +12,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from functools import partial
@@ -81,14 +82,6 @@ def sweeps(sweep: Sweep, sweeps_in: Callable[..., Any], tmp_path: Path) -> Any:
     return sweeps_in(tmp_path, FAULTS)
 
 
-def wait_for(what: Callable[[], bool], process: subprocess.Popen[bytes]) -> None:
-    end = time.monotonic() + 60
-    while not what():
-        assert process.poll() is None
-        assert time.monotonic() < end
-        time.sleep(0.01)
-
-
 def test_each_fault_is_its_cell_s_status_and_the_others_finish(sweep: Sweep, sweeps: Any) -> None:
     code, _, err = sweep("seed=2,3,0")
     assert code == 1, err
@@ -105,32 +98,39 @@ def test_each_fault_is_its_cell_s_status_and_the_others_finish(sweep: Sweep, swe
     assert not list((sweeps.folder / "s" / "locks").iterdir())
 
 
-def test_a_sweep_that_ctrl_c_has_ended_goes_on_and_two_at_once_train_each_cell_once(
+def wait_for(what: Callable[[], bool]) -> None:
+    end = time.monotonic() + 60
+    while not what():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def test_a_sweep_waits_for_the_cell_of_another_and_takes_it_over_when_ctrl_c_has_ended_that(
     sweep: Sweep, sweeps: Any
 ) -> None:
-    first = sweeps.start(*SMOKE, "seed=4")
-    wait_for((sweeps.folder / "hangs").exists, first.process)
-    first.process.send_signal(signal.SIGINT)
-    code, _, err = first.end()
+    other = sweeps.start(*SMOKE, "seed=4")
+    wait_for(lambda: (sweeps.folder / "hangs").exists() or other.process.poll() is not None)
+    (sweeps.folder / "healed").touch()
+
+    def stop() -> None:
+        wait_for(lambda: 5 in (found := sweeps.cells()) and (found[5] / "status.json").exists())
+        other.process.send_signal(signal.SIGINT)
+
+    stopping = threading.Thread(target=stop)
+    stopping.start()
+    code, _, err = sweep("seed=4,5")
+    stopping.join()
+    assert code == 0, err
+    assert "waiting for 1 cells: motorcycle / baseline / seed 4" in err
+    assert err.count("training cell") == 2  # of seed 5, and then of seed 4
+    assert all(status(sweeps.cells()[seed])["state"] == "done" for seed in (4, 5))
+    assert not list((sweeps.folder / "s" / "locks").iterdir())
+    code, _, err = other.end()
     sweeps.leave_nothing_running()  # its child, and that one's child, have ended too
     assert code == 130
     hint = "Finished cells are kept: run the same command again to continue."
     assert err.splitlines()[-1] == f"stopped by SIGINT. {hint}"
     assert "Traceback" not in err
-
-    (sweeps.folder / "healed").touch()
-    other = sweeps.start(*SMOKE, "seed=4,5")
-    wait_for(lambda: "plan:" in (other.printed / "err").read_text(), other.process)
-    both = [sweep("seed=4,5"), other.end()]
-    sweeps.leave_nothing_running()
-    assert [code for code, *_ in both] == [0, 0], both
-    assert sum(err.count("training cell") for *_, err in both) == 2
-    assert any("unfinished" in err for *_, err in both)
-    (table, other_table) = (out for _, out, _ in both)
-    assert table == other_table
-    assert "failed" not in table
-    assert all(status(sweeps.cells()[seed])["state"] == "done" for seed in (4, 5))
-    assert not list((sweeps.folder / "s" / "locks").iterdir())
 
 
 #: In a mount namespace of its own: the store moves to a small disk, which has hardly any room, and

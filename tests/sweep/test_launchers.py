@@ -99,4 +99,4 @@ def test_joblib_runs_two_cells_at_once_and_a_killed_worker_costs_nothing(
     assert not (tmp_path / "kill").exists()
     assert "TerminatedWorkerError" in err
     assert "of its 2 cells these are not finished:" in err
-    assert done(tmp_path) == [1, 1]  # of two cores
+    assert len(done(tmp_path)) == 2
