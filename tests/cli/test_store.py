@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import io
-import os
-import subprocess
 import sys
 import tarfile
 from collections.abc import Callable
@@ -54,23 +52,6 @@ def xrgs_store(call_command: Call, tmp_path: Path, begun: Callable[[str, int], C
         return call_command("store", *arguments, "--store", "s")
 
     return run
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("xrgs_store")
-def test_a_reader_of_the_list_that_ends_first_is_no_error(tmp_path: Path) -> None:
-    reader, writer = os.pipe()
-    os.close(reader)
-    words = ["-c", "from xrgs.cli.store import main; main()", "list", "--store", "s"]
-    done = subprocess.run(
-        [sys.executable, "-P", *words],
-        cwd=tmp_path,
-        stdout=writer,
-        stderr=subprocess.PIPE,
-        check=False,
-    )
-    os.close(writer)
-    assert (done.returncode, done.stderr) == (0, b"")
 
 
 def cells(tmp_path: Path) -> list[str]:

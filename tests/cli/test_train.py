@@ -231,13 +231,6 @@ def test_a_scene_with_odd_names_is_made_and_its_last_lines_lead_on(
     (cell,) = Store(tmp_path / store).cell_folders()
     assert cell.state().name == "done"
     assert {file.stem for file in (cell.path / "renders").iterdir()} == set(views)
-    code, out, err = call_command("report", "--store", store, "--out", "report")
-    assert code == 0, err
-    assert folder.name in out
-    figures, table = [*(tmp_path / "report/figures").iterdir()], tmp_path / "report/table.md"
-    assert figures
-    assert all(f"](figures/{file.name})" in table.read_text() for file in figures)
-    assert all(file.name.isascii() for file in figures)
 
     code, out, err = call_command("train", *small, "--out=a.ply")
     assert code == 0, err  # found again, and exported by its name
