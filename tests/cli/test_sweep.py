@@ -197,8 +197,8 @@ def test_bad_input_is_named(
     (tmp_path / "empty").mkdir()
     (tmp_path / "in-the-way").write_text("a file")
     photographs(tmp_path / "one", 1)
-    preset = [] if arguments[0].startswith("rerun=") else ["preset=smoke"]
-    code, out, err = sweep_here(*preset, *arguments)
+    dry = [] if arguments[0].startswith("rerun=") else ["preset=smoke", "dry_run=true"]
+    code, out, err = sweep_here(*dry, *arguments)
     assert code == 1
     for text in named:
         assert text in out + err

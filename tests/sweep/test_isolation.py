@@ -102,7 +102,7 @@ def wait_for(what: Callable[[], bool]) -> None:
     end = time.monotonic() + 60
     while not what():
         assert time.monotonic() < end
-        time.sleep(0.01)
+        time.sleep(0.1)
 
 
 def test_a_sweep_waits_for_the_cell_of_another_and_takes_it_over_when_ctrl_c_has_ended_that(
