@@ -306,11 +306,6 @@ def data() -> Dataset:
     return ramps()
 
 
-def _command(name: str) -> list[str]:
-    """Return the command line of `xrgs-<name>` of the package under test."""
-    return [sys.executable, "-P", "-c", f"from xrgs.cli.{name} import main; main()"]
-
-
 @pytest.fixture(scope="session")
 def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
     """(name, function of a folder) -> the folder, which the function has made for all workers."""
@@ -606,11 +601,8 @@ def call_command(
 
     def call(name: str, *arguments: str) -> tuple[int, str, str]:
         main = importlib.import_module(f"xrgs.cli.{name}").main
-        for module in (
-            sys.modules[f"xrgs.cli.{name}"],
-            sweep_command,
-        ):  # keep pytest's signal handlers
-            monkeypatch.setattr(module, "exit_on_signal", nullcontext, raising=False)
+        for module in (name, "sweep"):  # pytest keeps its own handlers of signals
+            monkeypatch.setattr(f"xrgs.cli.{module}.exit_on_signal", nullcontext, raising=False)
         monkeypatch.chdir(tmp_path)
         monkeypatch.setenv("OMP_WAIT_POLICY", os.environ.get("OMP_WAIT_POLICY", "passive"))
         monkeypatch.setattr(sys, "argv", [f"xrgs-{name}", *arguments])

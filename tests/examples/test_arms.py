@@ -42,9 +42,8 @@ def test_it_is_swept_and_trained_again_only_where_it_is_named(
         "baseline=false",
     )
     assert code == 0, err
-    (file,) = (tmp_path / "s" / "cells").glob("*/identity.json")
-    assert NAME in json.loads(file.read_text())["components"]["plugins"]
-    cell = file.parent
+    (cell,) = (tmp_path / "s" / "cells").iterdir()
+    assert NAME in json.loads((cell / "identity.json").read_text())["components"]["plugins"]
     with (cell / "history.csv").open() as file:
         *_, third, last = csv.DictReader(file)
     # Two steps after densification, on views that had no such step before: none is skipped.

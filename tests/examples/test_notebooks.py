@@ -90,7 +90,7 @@ def test_two_recipes_are_compared_and_filmed(
 ) -> None:
     """With the cells of another sweep; its own is planned."""
     shutil.copytree(swept[0] / "s", tmp_path / "xrgs-store")
-    plans = []
+    plans: list[str] = []
 
     def system(line: str) -> None:
         name, *arguments = shlex.split(line)
