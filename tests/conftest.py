@@ -18,8 +18,8 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Generator, Iterator
-from contextlib import suppress
+from collections.abc import Callable, Generator, Iterator, Mapping
+from contextlib import nullcontext, redirect_stderr, redirect_stdout, suppress
 from copy import deepcopy
 from dataclasses import asdict, dataclass, field
 from functools import cache, partial, reduce
@@ -34,12 +34,15 @@ import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hypothesis import HealthCheck, settings
 
-from tests import forks, pdflatex
+from tests import pdflatex
 from xrgs import composing, config
+from xrgs.cli import sweep as sweep_command
+from xrgs.errors import XrgsError
 from xrgs.evaluation.lpips import weights
 from xrgs.mixture import variant
 from xrgs.safeio import code
 from xrgs.store.store import Store
+from xrgs.sweep import job
 
 # torch is imported where it is used: the process that hands out the tests needs none.
 if TYPE_CHECKING:
@@ -303,42 +306,6 @@ def data() -> Dataset:
     return ramps()
 
 
-def _command(name: str) -> list[str]:
-    """Return the command line of `xrgs-<name>` of the package under test."""
-    return [sys.executable, "-P", "-c", f"from xrgs.cli.{name} import main; main()"]
-
-
-@pytest.fixture(scope="session")
-def run_command() -> Callable[..., tuple[int, str, str]]:
-    """Return a function that runs a command in a process of its own.
-
-    Its arguments are (name, folder, *arguments, **environment), the name without "xrgs-"; it
-    returns the exit code, stdout and stderr. `call_command` is faster and will mostly do, and
-    `forked_command` for what has to run apart.
-    `sweeps_in` is for sweeps that are killed, or whose child processes are checked.
-    """
-
-    def run(name: str, folder: Path, *arguments: str, **environment: str) -> tuple[int, str, str]:
-        done = subprocess.run(
-            [*_command(name), *arguments],
-            cwd=folder,
-            env=os.environ | environment,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        return done.returncode, done.stdout, done.stderr
-
-    return run
-
-
-@pytest.fixture(scope="session")
-def forked_command() -> Iterator[Callable[..., tuple[int, str, str]]]:
-    """Return `run_command` for commands that are forked, which start seconds earlier."""
-    with forks.server(*forks.MODULES) as run:
-        yield run
-
-
 @pytest.fixture(scope="session")
 def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
     """(name, function of a folder) -> the folder, which the function has made for all workers."""
@@ -371,6 +338,69 @@ def smoke_variants(made_once: Callable[..., Path]) -> Path:
     return made_once("smoke", build) / "s" / "variants"
 
 
+def work_here(work: str, request: Mapping[str, Any], *_: object) -> dict[str, Any]:
+    """Do what `job.run_in_child` does in this process, which has imported torch already."""
+    from xrgs.runtime.signals import StopRequest
+    from xrgs.store import cell, trimming
+    from xrgs.store.cell_folder import CellFolder
+
+    request = json.loads(json.dumps(request))
+    try:
+        if work == "cell":
+            folder = CellFolder(Path(request["cell"]))
+            built = variant.load(Path(request["variant"]))
+            cell.run_cell(folder.config(), built, folder, StopRequest())
+            return {"found": folder.summary().found}
+        conf, store = composing.from_dict(request["conf"]), Store(Path(request["store"]))
+        if (trimmed := request.get("variant")) is None:
+            made = variant.build(conf.scene, conf.variant, store.variants, store.scenes)
+            return {"variant": made.id}
+        trimming.restore_variant(store.variants, trimmed, conf.scene, conf.variant, store.scenes)
+        return {}
+    except XrgsError as error:
+        raise job.WorkError(str(error)) from error
+
+
+@pytest.fixture
+def here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let sweeps build variants and train cells in this process."""
+    monkeypatch.setattr(job, "run_in_child", work_here)
+
+
+SMOKE = ("scene=motorcycle", "preset=smoke", "train.steps=8")
+#: The command line of `swept`.
+SWEEP = ("+ablation=consistency", *SMOKE, "track=csv", "threads=1", "store=s")
+
+
+@pytest.fixture(scope="session")
+def swept(made_once: Callable[..., Path], smoke_variants: Path) -> tuple[Path, str]:
+    """A folder with a finished smoke sweep in its store `s`, and what was printed.
+
+    The store's folder `cells` is a link.
+    """
+
+    def sweep_once(folder: Path) -> None:
+        shutil.copytree(smoke_variants, folder / "s" / "variants")
+        (folder / "disk").mkdir()
+        (folder / "s" / "cells").symlink_to(folder / "disk")
+        with (
+            pytest.MonkeyPatch.context() as patch,
+            redirect_stdout(io.StringIO()) as out,
+            redirect_stderr(io.StringIO()) as err,
+        ):
+            patch.chdir(folder)
+            patch.setenv("OMP_WAIT_POLICY", os.environ.get("OMP_WAIT_POLICY", "passive"))
+            patch.setattr(sweep_command, "exit_on_signal", nullcontext)
+            patch.setattr(job, "run_in_child", work_here)
+            patch.setattr(sys, "argv", ["xrgs-sweep", *SWEEP])
+            sweep_command.main()
+        assert err.getvalue().count("training cell") == 2
+        (folder / "printed").write_text(out.getvalue(), encoding="utf-8")
+
+    folder = made_once("swept", sweep_once)
+    return folder, (folder / "printed").read_text(encoding="utf-8")
+
+
 @dataclass(frozen=True)
 class Sweep:
     """A running process of `xrgs-sweep`."""
@@ -383,6 +413,10 @@ class Sweep:
         """Wait for the end; return the exit code, stdout and stderr."""
         code = self.process.wait(300)
         return code, (self.printed / "out").read_text(), (self.printed / "err").read_text()
+
+
+#: The command line of `xrgs-sweep` of the package under test.
+COMMAND = (sys.executable, "-P", "-c", "from xrgs.cli.sweep import main; main()")
 
 
 @dataclass(frozen=True)
@@ -406,7 +440,7 @@ class Sweeps:
             changes["PYTHONPATH"] = os.pathsep.join(filter(None, path))
         with (printed / "out").open("wb") as out, (printed / "err").open("wb") as err:
             process = subprocess.Popen(
-                [*_command("sweep"), "store=s", "threads=1", *arguments],
+                [*COMMAND, "store=s", "threads=1", *arguments],
                 cwd=self.folder,
                 env=os.environ | changes,
                 stdout=out,
@@ -567,6 +601,8 @@ def call_command(
 
     def call(name: str, *arguments: str) -> tuple[int, str, str]:
         main = importlib.import_module(f"xrgs.cli.{name}").main
+        for module in (name, "sweep"):  # pytest keeps its own handlers of signals
+            monkeypatch.setattr(f"xrgs.cli.{module}.exit_on_signal", nullcontext, raising=False)
         monkeypatch.chdir(tmp_path)
         monkeypatch.setenv("OMP_WAIT_POLICY", os.environ.get("OMP_WAIT_POLICY", "passive"))
         monkeypatch.setattr(sys, "argv", [f"xrgs-{name}", *arguments])
@@ -580,6 +616,14 @@ def call_command(
         return code, out, err + message
 
     return call
+
+
+@pytest.fixture
+def sweep_here(
+    call_command: Callable[..., tuple[int, str, str]],
+) -> Callable[..., tuple[int, str, str]]:
+    """Return `call_command` for `xrgs-sweep`."""
+    return partial(call_command, "sweep")
 
 
 @pytest.fixture

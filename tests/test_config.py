@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import math
 import re
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import MISSING, Field, asdict, fields, is_dataclass, replace
@@ -348,15 +346,6 @@ def test_texts_are_taken_literally(baseline: Conf, text: str) -> None:
     assert from_dict(asdict(conf)) == conf
 
 
-@pytest.mark.slow
-def test_every_config_is_read_back_from_json(compose: Compose) -> None:
-    """tests/test_ablations.py does so for the ablations."""
-    for group in ("preset", "variant"):
-        for file in sorted((CONF_DIR / group).glob("*.yaml")):
-            conf = compose(f"{group}={file.stem}")
-            assert from_dict(json.loads(json.dumps(asdict(conf)))) == conf, file
-
-
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
@@ -428,24 +417,6 @@ def test_a_file_from_before_components_were_moved_out_has_their_plugins(
         assert conf.components.plugins == (moved if on else {})
         conf.components.plugins = {}
         assert (conf, added) == (baseline, {})
-
-
-@pytest.mark.slow
-def test_the_process_of_a_cell_reads_its_config_without_hydra(
-    baseline: Conf, tmp_path: Path
-) -> None:
-    (file := tmp_path / "config.json").write_text(json.dumps(asdict(baseline)))
-    script = (
-        "import sys; from pathlib import Path; import xrgs.sweep.job, xrgs.store.cell;"
-        "from xrgs.composing import from_dict, from_file;"
-        f"conf, _ = from_file(Path({str(file)!r}));"
-        "from dataclasses import asdict; assert from_dict(asdict(conf)) == conf;"
-        "sys.exit(str({'hydra', 'omegaconf'} & sys.modules.keys() or ''))"
-    )
-    done = subprocess.run(
-        [sys.executable, "-P", "-c", script], capture_output=True, text=True, check=False
-    )
-    assert done.stderr.strip() == ""
 
 
 def test_the_baseline_has_no_component_in_its_identity(compose: Compose) -> None:

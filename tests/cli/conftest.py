@@ -6,9 +6,7 @@ import hashlib
 import os
 import shutil
 from collections.abc import Callable, Mapping
-from contextlib import nullcontext
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -18,17 +16,12 @@ import pytest
 from PIL import Image
 
 import xrgs.report
-from xrgs.cli import sweep
 from xrgs.mixture import variant
 from xrgs.safeio.atomic import write_json
 from xrgs.store.cell_folder import CellFolder
 from xrgs.store.store import Store
 from xrgs.sweep import job
 
-RunCommand = Callable[..., tuple[int, str, str]]
-SMOKE = ("scene=motorcycle", "preset=smoke", "train.steps=8")
-#: The command line of `swept`.
-SWEEP = ("+ablation=consistency", *SMOKE, "track=csv", "threads=1", "store=s")
 #: Modules that take long to import, and that a plan and `--help` must do without.
 HEAVY = ("kornia", "matplotlib", "pandas", "pycolmap", "scipy", "skimage", "torch")
 
@@ -68,13 +61,6 @@ def without_heavy(tmp_path_factory: pytest.TempPathFactory) -> str:
     for name in HEAVY:
         (folder / f"{name}.py").write_text(f"raise ImportError('{name} was imported')")
     return os.pathsep.join([str(folder), os.environ.get("PYTHONPATH", "")])
-
-
-@pytest.fixture
-def sweep_here(call_command: RunCommand, monkeypatch: pytest.MonkeyPatch) -> RunCommand:
-    """(*arguments) -> exit code, stdout and stderr of `xrgs-sweep`, run in this process."""
-    monkeypatch.setattr(sweep, "exit_on_signal", nullcontext)  # keep pytest's own signal handlers
-    return partial(call_command, "sweep")
 
 
 @dataclass
@@ -126,28 +112,6 @@ def children(monkeypatch: pytest.MonkeyPatch) -> Children:
     monkeypatch.setattr(variant, "find", made.find)
     monkeypatch.setattr(xrgs.report, "build", lambda *_: SimpleNamespace(text="the table"))
     return made
-
-
-@pytest.fixture(scope="session")
-def swept(
-    forked_command: RunCommand, made_once: Callable[..., Path], smoke_variants: Path
-) -> tuple[Path, str]:
-    """A folder with a finished smoke sweep in its store `s`, and what was printed.
-
-    The store's folder `cells` is a link.
-    """
-
-    def sweep_once(folder: Path) -> None:
-        shutil.copytree(smoke_variants, folder / "s" / "variants")
-        (folder / "disk").mkdir()
-        (folder / "s" / "cells").symlink_to(folder / "disk")
-        code, out, err = forked_command("sweep", folder, *SWEEP)
-        assert code == 0, err
-        assert err.count("training cell") == 2
-        (folder / "printed").write_text(out, encoding="utf-8")
-
-    folder = made_once("swept", sweep_once)
-    return folder, (folder / "printed").read_text(encoding="utf-8")
 
 
 @pytest.fixture

@@ -15,15 +15,14 @@ RunCommand = Callable[..., tuple[int, str, str]]
 
 @pytest.mark.slow
 def test_a_trained_cell_becomes_a_load_of_the_benchmark(
-    forked_command: RunCommand, swept: tuple[Path, str]
+    call_command: RunCommand, swept: tuple[Path, str], tmp_path: Path
 ) -> None:
-    folder, _ = swept
-    cell = sorted((folder / "s" / "cells").iterdir())[0]
+    cell = sorted((swept[0] / "s" / "cells").iterdir())[0]
     view = json.loads((cell / "status.json").read_text())["views"][0]
     save = ("--save", "a.npz", "--cell", str(cell), "--view")
-    code, out, err = forked_command("bench", folder, *save, view)
+    code, out, err = call_command("bench", *save, view)
     assert code == 0, err
-    with np.load(folder / "a.npz") as stored:
+    with np.load(tmp_path / "a.npz") as stored:
         count = json.loads((cell / "summary.json").read_text())["gaussians"]
         assert stored["means"].shape == (count, 3)
         assert stored["sh"].shape == (count, 16, 3)
@@ -31,7 +30,7 @@ def test_a_trained_cell_becomes_a_load_of_the_benchmark(
         with Image.open(cell / "renders" / f"{view}.png") as picture:
             assert picture.size == (stored["width"], stored["height"])
     assert f"{count} Gaussians" in out
-    code, _, err = forked_command("bench", folder, *save, "none")
+    code, _, err = call_command("bench", *save, "none")
     assert code != 0
     assert "--view none: " in err
     assert view in err

@@ -24,22 +24,32 @@ COMMANDS = ("bench", "data", "render", "report", "status", "store", "train", "vi
 
 
 @pytest.mark.slow
-def test_help_answers_at_once(tmp_path: Path, without_heavy: str) -> None:
-    """All commands in one process, in which no module that takes long can be imported."""
+def test_help_and_a_plan_need_no_module_that_takes_long(
+    tmp_path: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+    photographs: Callable[..., Path],
+    without_heavy: str,
+) -> None:
+    """All commands in one process, in which no such module can be imported."""
     script = """
 import sys
 from importlib import import_module
-for command in sys.argv[1:]:
+words = sys.argv[1:6]
+for command in sys.argv[6:]:
     print(f"of {command}:", flush=True)
     sys.argv = [f"xrgs-{command}", "--help"]
     try:
         import_module(f"xrgs.cli.{command}").main()
     except SystemExit as end:
         assert not end.code
+sys.argv[1:] = words
+import_module("xrgs.cli.sweep").main()
 """
     commands = ("sweep", *COMMANDS)
+    scene = photographs(tmp_path_factory.mktemp("scene"), 5)
+    words = ("scene=folder", f"scene.path={scene}", "+ablation=consistency", "seed=0,1")
     done = subprocess.run(
-        [sys.executable, "-P", "-c", script, *commands],
+        [sys.executable, "-P", "-c", script, *words, "dry_run=true", *commands],
         cwd=tmp_path,
         env=os.environ | {"PYTHONPATH": without_heavy},
         capture_output=True,
@@ -50,6 +60,9 @@ for command in sys.argv[1:]:
     for command in commands:
         _, _, text = done.stdout.partition(f"of {command}:\n")
         assert f"xrgs-{command} " in text.splitlines()[0]
+    assert "plan: 4 cells" in done.stderr
+    assert done.stderr.count("variant not built") == 4
+    assert not list(tmp_path.iterdir())  # nothing is written
 
 
 def test_help_has_what_is_said_of_an_option_without_the_breaks_of_its_lines(

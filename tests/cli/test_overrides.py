@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import shlex
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -19,7 +18,6 @@ from xrgs.cli.overrides import explained, replaced_words, with_options_first, wi
 from xrgs.cli.sweep import texts
 from xrgs.composing import ARMS
 from xrgs.errors import XrgsError
-from xrgs.photos.scenes import motorcycle
 from xrgs.sweep.axes import expand
 
 RunCommand = Callable[..., tuple[int, str, str]]
@@ -221,36 +219,6 @@ def test_the_home_folder_of_a_store_is_not_a_folder_called_tilde(
     sweep_here("scene=motorcycle", "preset=smoke", "+ablation=baseline", "store=~/s")
     assert (tmp_path / "home/s/cells").is_dir()
     assert not (tmp_path / "~").exists()
-
-
-@pytest.mark.slow
-def test_a_scene_with_odd_names_is_swept_and_reported(
-    forked_command: RunCommand, tmp_path: Path
-) -> None:
-    scene = tmp_path / f"-部屋 🙂 {{it's}} 50%=#1; {ACCENT}, a"
-    scene.mkdir()
-    views = ['-a b\'s & "c" (1) 🙂', f"[{ACCENT}]=50%#, $x.y"]
-    for name, file in zip(views, motorcycle.files().values(), strict=True):
-        shutil.copy(file, scene / f"{name}.png")
-    conf = ["preset=smoke", "train.steps=2", "variant.test_every=0", "variant.min_hr=1"]
-    conf += ["variant.long_side=185", "variant.sfm.reference=false"]
-    words = ("+ablation=curriculum", "scene=folder", f"scene.path={scene.name}", *conf)
-    store = "st öre, 'a' {b} 🙂"
-    code, out, err = forked_command("sweep", tmp_path, *words, f"store={store}")
-    assert code == 0, err
-    assert scene.name in out
-    home = tmp_path / store
-    for cell in (home / "cells").iterdir():
-        assert {file.stem for file in (cell / "renders").iterdir()} == set(views)
-    (report,) = (home / "reports").iterdir()
-    pictures = list((report / "figures").iterdir())
-    assert len(pictures) == 2
-    page = (report / "table.md").read_text()
-    assert all(f"](figures/{file.name})" in page and file.name.isascii() for file in pictures)
-    assert str(Path(*report.parts[-3:])) in out
-    code, out, err = forked_command("status", tmp_path, "--store", store)
-    assert code == 0, err
-    assert scene.name in out
 
 
 def test_help_and_a_sweep_with_nothing_say_what_to_type(

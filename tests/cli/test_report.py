@@ -6,13 +6,16 @@ import inspect
 from collections.abc import Callable
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from xrgs.cli.report import report
 from xrgs.report import Design
+from xrgs.safeio.sanitize import for_file_name
 from xrgs.store.store import Store
 
 RunCommand = Callable[..., tuple[int, str, str]]
+SCENE = "-部屋 🙂 {it's} 50%=#1; é, a"
 
 
 def test_the_sweeps_are_listed(call_command: RunCommand, tmp_path: Path) -> None:
@@ -29,21 +32,26 @@ def test_a_report_has_the_pictures_the_base_and_the_outcomes_that_are_named(
     call_command: RunCommand, store: Path, tmp_path: Path
 ) -> None:
     """This store has one replicate, so that its report has no verdict and explains none."""
-    out = tmp_path / "out"
+    out, record = tmp_path / "out", Store(store).sweep_record()
+    named_oddly = [msgspec.structs.replace(row, scene=SCENE) for row in record.cells]
+    Store(store).write_sweep(["named oddly"], named_oddly)
     arguments = ("report", "--store", str(store), "--out", str(out))
     code, printed, err = call_command(*arguments, "--pictures", "none", "--against", "consistency")
     assert code == 0, err
     assert "baseline against consistency" in printed
     assert not list((out / "figures").iterdir())
     named = ("--outcomes", "lpips", "ssim", "--headline", "consistency", "--margin-lpips", "7")
-    picture = "motorcycle--consistency--training"
+    picture = f"{for_file_name(SCENE)}--consistency--training"
     code, printed, err = call_command(*arguments, *named, "--pictures", picture)
     assert code == 0, err
     assert "consistency against baseline" in printed
     assert "one replicate: no interval" in printed
-    assert [file.stem for file in (out / "figures").iterdir()] == [picture]
+    (file,) = (out / "figures").iterdir()
+    assert file.stem == picture
+    assert picture.isascii()
+    assert f"](figures/{file.name})" in (out / "table.md").read_text()
     for words, message in (
-        ("--pictures gone", "there is no picture of that name; choose from: motorcycle--consist"),
+        ("--pictures gone", "there is no picture of that name; choose from: "),
         ("--against gone", "the sweep has no such label; choose from: baseline, consistency"),
         ("--outcomes lpips_vgg", "these cells have no such metric; choose from: training_time_s"),
         ("--outcomes nice", "these cells have no such metric; choose from: "),

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import io
-import os
-import subprocess
 import sys
 import tarfile
 from collections.abc import Callable
-from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 
 from tests.cli.conftest import finish
-from xrgs.cli import store as command
 from xrgs.config import Conf
 from xrgs.store.attempts import begin_attempt, plan_cell
 from xrgs.store.cell_folder import CellFolder
@@ -40,14 +36,8 @@ def begun(tmp_path: Path, compose: Callable[..., Conf]) -> Callable[[str, int], 
 
 
 @pytest.fixture
-def xrgs_store(
-    call_command: Call,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    begun: Callable[[str, int], CellFolder],
-) -> Call:
+def xrgs_store(call_command: Call, tmp_path: Path, begun: Callable[[str, int], CellFolder]) -> Call:
     """(*arguments) -> exit code, stdout and stderr of `xrgs-store` on a store of two cells."""
-    monkeypatch.setattr(command, "exit_on_signal", nullcontext)  # keep pytest's own handlers
     store = Store(tmp_path / "s")
     store.prepare()
     for name, steps in (("abc", 3), ("abd", 4)):
@@ -62,23 +52,6 @@ def xrgs_store(
         return call_command("store", *arguments, "--store", "s")
 
     return run
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("xrgs_store")
-def test_a_reader_of_the_list_that_ends_first_is_no_error(tmp_path: Path) -> None:
-    reader, writer = os.pipe()
-    os.close(reader)
-    words = ["-c", "from xrgs.cli.store import main; main()", "list", "--store", "s"]
-    done = subprocess.run(
-        [sys.executable, "-P", *words],
-        cwd=tmp_path,
-        stdout=writer,
-        stderr=subprocess.PIPE,
-        check=False,
-    )
-    os.close(writer)
-    assert (done.returncode, done.stderr) == (0, b"")
 
 
 def cells(tmp_path: Path) -> list[str]:

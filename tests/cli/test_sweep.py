@@ -83,8 +83,6 @@ def test_without_the_baseline_the_ablations_are_trained_alone(
     assert len(children.trained) == 1
     rows = Store(tmp_path / "s").sweep_record().cells
     assert [(row.label, row.baseline_id) for row in rows] == [("densify", None)]
-    _, _, err = sweep_here("+ablation=densify", *SCENE, "dry_run=true")
-    assert "plan: 2 cells, 1 done" in err
     control = ("+ablation=count_matched", "matched_to=baseline", *SCENE)
     _, _, err = sweep_here(*control, "baseline=false", "dry_run=true")
     assert labels(err) == {"baseline", "count_matched to baseline"}, "the count is taken from it"
@@ -103,79 +101,52 @@ def test_a_cell_that_fails_leaves_the_others_and_is_not_tried_again(
     assert out.startswith("the table\n\n2 done cells\n")
     assert "failed: it raised" in err
     assert len(children.trained) == 3
-    code, _, err = sweep_here("seed=0,1,2", *SCENE)
+    children.failures = {5: "it raised", 6: "it raised"}
+    code, _, err = sweep_here("seed=1,5,6", *SCENE, "fail_fast=true")
     assert code == 1
-    assert len(children.trained) == 3
     assert "retry=failed trains them again" in err
-    children.failures = {1: "it raised", 5: "it raised"}
-    code, _, err = sweep_here("seed=1,5", *SCENE, "retry=failed", "fail_fast=true")
-    assert code == 1
     assert "no further cell is started: fail_fast, and a cell failed" in err
     assert len(children.trained) == 4
     children.failures = {}
-    code, _, err = sweep_here("seed=0,1,2", *SCENE, "retry=failed")
+    code, _, err = sweep_here("seed=1", *SCENE, "retry=failed")
     assert code == 0, err
     assert len(children.trained) == 5
 
 
 @pytest.mark.slow
-def test_each_arm_and_replicate_has_a_control_and_a_count_out_of_reach_fails_one(
+def test_each_arm_has_a_control_and_a_count_out_of_reach_fails_one(
     sweep_here: SweepHere, children: Any, tmp_path: Path
 ) -> None:
     arms = "consistency,gradient_scaling"
-    arguments = (f"+ablation={arms},count_matched", f"matched_to={arms}", "seed=0,1", *SCENE)
-    # Six baselines and arms come first; the last one trained is gradient_scaling's of seed 1.
-    children.unreachable = children.gaussians + 6
+    arguments = (f"+ablation={arms},count_matched", f"matched_to={arms}", *SCENE)
+    # The baseline and the arms come first; the last one trained is gradient_scaling.
+    children.unreachable = children.gaussians + 3
     code, _, err = sweep_here(*arguments)
     assert code == 1
     states = [line.split()[0] for line in err.splitlines() if "motorcycle /" in line]
-    assert states[:10].count("waits") == 4, "for the counts of their arms"
+    assert states[:5].count("waits") == 2, "for the counts of their arms"
     store = Store(tmp_path / "s")
-    rows = {(row.label, row.seed): str(row.cell_id) for row in store.sweep_record().cells}
-    assert len(rows) == len(children.trained) == 10
+    rows = {row.label: str(row.cell_id) for row in store.sweep_record().cells}
+    assert len(rows) == len(children.trained) == 5
     missing = []
     for arm in arms.split(","):
-        for seed in (0, 1):
-            count = store.cell(rows[arm, seed]).summary().gaussians
-            control = store.cell(rows[f"count_matched to {arm}", seed])
-            assert control.identity().components["count_matched"]["gaussians"] == count
-            if control.state().name != "done":
-                missing.append((count, control.state().reason))
+        count = store.cell(rows[arm]).summary().gaussians
+        control = store.cell(rows[f"count_matched to {arm}"])
+        assert control.identity().components["count_matched"]["gaussians"] == count
+        if control.state().name != "done":
+            missing.append((count, control.state().reason))
     assert missing == [
         (children.unreachable, f"no threshold gave {children.unreachable} Gaussians")
     ]
-    assert "plan: 10 cells, 9 done" in sweep_here(*arguments)[2]
-    assert len(children.trained) == 10
+    assert "plan: 5 cells, 4 done" in sweep_here(*arguments, "dry_run=true")[2]
 
 
 @pytest.mark.slow
-def test_a_value_that_changes_a_number_is_another_cell(
-    sweep_here: SweepHere, children: Any
-) -> None:
-    arguments = ("+ablation=consistency", "train.steps=8", *SCENE)
-    code, _, err = sweep_here(*arguments)
+def test_a_sweep_file_plans(sweep_here: SweepHere) -> None:
+    """tests/test_ablations.py composes each value of every file."""
+    code, _, err = sweep_here("+sweeps=paper_size", "scene=motorcycle", "seed=0", "dry_run=true")
     assert code == 0, err
-    for changes, done in (
-        (["components.loss_weighting.lr_weight=0.5"], 1),  # the baseline has no component
-        (["threads=1", "data_root=x", "scene.name=y", "store=./s", "checkpoint_s=7"], 2),
-    ):
-        keys = {change.partition("=")[0] for change in changes}
-        kept = [word for word in arguments if word.partition("=")[0] not in keys]
-        _, _, err = sweep_here(*kept, *changes, "dry_run=true")
-        assert f"plan: 2 cells, {done} done" in err
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["ablations", "table2"])
-def test_a_sweep_file_plans(sweep_here: SweepHere, name: str) -> None:
-    """With controls, and without; tests/test_ablations.py composes each value of every file."""
-    words = (f"+sweeps={name}", "scene=motorcycle", "seed=0", "dry_run=true")
-    code, _, err = sweep_here(*words)
-    assert code == 0, err
-    planned = labels(err)
-    assert planned > {"baseline"}
-    if name in WHOLE:
-        assert {label.partition(" to ")[0] for label in planned} == arms(name)
+    assert {label.partition(" to ")[0] for label in labels(err)} == arms("paper_size")
 
 
 def test_every_ablation_is_in_a_sweep() -> None:
@@ -207,11 +178,9 @@ def test_a_launcher_named_in_an_ablation_is_refused(sweep_here: SweepHere, tmp_p
     [
         (["train.steps=many"], ["train.steps", "many"]),
         (["scene=folder"], ["scene.path"]),
-        (["scene=folder", "scene.path=gone"], ["gone"]),
         (["scene.path=empty"], ["write scene=folder scene.path=empty"]),
         (["scene=folder", "scene.path=one"], ["one"]),
         (["store=in-the-way"], ["in-the-way", "store="]),
-        (["rerun=gone"], ["rerun=gone", "no such folder"]),
         (["rerun=~/gone"], [f"rerun={Path.home() / 'gone'}: there is no such folder"]),
         (["rerun=gone", "seed=1"], ["seed", "rerun= takes out="]),
         (["rerun=gone", "threads=x"], ["threads"]),
@@ -228,55 +197,12 @@ def test_bad_input_is_named(
     (tmp_path / "empty").mkdir()
     (tmp_path / "in-the-way").write_text("a file")
     photographs(tmp_path / "one", 1)
-    preset = [] if arguments[0].startswith("rerun=") else ["preset=smoke"]
-    code, out, err = sweep_here(*preset, *arguments)
+    dry = [] if arguments[0].startswith("rerun=") else ["preset=smoke", "dry_run=true"]
+    code, out, err = sweep_here(*dry, *arguments)
     assert code == 1
     for text in named:
         assert text in out + err
     assert "Traceback" not in err
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("arguments", "named"),
-    [
-        (["scene=folder", "scene.path=broken"], "broken"),
-        (["+ablation=exposure", "components.exposure.lr_final=2"], "components.exposure.lr_final"),
-    ],
-    ids=" ".join,
-)
-def test_bad_input_that_a_child_finds_is_named(
-    forked_command: RunCommand,
-    tmp_path: Path,
-    photographs: Callable[..., Path],
-    arguments: list[str],
-    named: str,
-) -> None:
-    for file in photographs(tmp_path / "broken", 5).iterdir():
-        file.write_bytes(file.read_bytes()[:60])
-    smoke = ("scene=motorcycle", "preset=smoke", "train.steps=2", "store=s")
-    code, out, err = forked_command("sweep", tmp_path, *smoke, *arguments)
-    assert code == 1
-    assert named in out + err
-    assert "Traceback" not in err
-
-
-@pytest.mark.slow
-def test_a_dry_run_plans_without_torch_and_writes_nothing(
-    run_command: RunCommand,
-    tmp_path: Path,
-    tmp_path_factory: pytest.TempPathFactory,
-    photographs: Callable[..., Path],
-    without_heavy: str,
-) -> None:
-    scene = photographs(tmp_path_factory.mktemp("scene"), 5)
-    arguments = ("+ablation=consistency", "seed=0,1", "dry_run=true", "store=s")
-    words = ("scene=folder", f"scene.path={scene}", *arguments)
-    code, _, err = run_command("sweep", tmp_path, *words, PYTHONPATH=without_heavy)
-    assert code == 0, err
-    assert "plan: 4 cells" in err
-    assert err.count("variant not built") == 4
-    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(
@@ -308,7 +234,6 @@ def test_a_dry_run_fails_where_photographs_are_missing_and_says_once_how_to_get_
     assert code == 1
     assert err.count("scene.path=gone: no such folder") == 1
     assert err.count("(the same)") == 1
-    assert list(tmp_path.iterdir()) == []
     study = ("scene=llff/fern,llff/flower", "dry_run=true")
     code, _, err = sweep_here(*study, "data_root=x/my photographs")
     assert code == 1
@@ -324,12 +249,9 @@ def test_a_dry_run_fails_where_photographs_are_missing_and_says_once_how_to_get_
 
 
 @pytest.mark.slow
-def test_captures_are_looked_for_in_data_root(sweep_here: SweepHere) -> None:
-    scenes = ("scene=captures/monstree,captures/ollie", "dry_run=true")
-    code, _, err = sweep_here(*scenes, "data_root=x/y")
+def test_captures_are_looked_for_in_their_own_folder(sweep_here: SweepHere) -> None:
+    code, _, err = sweep_here("scene=captures/monstree,captures/ollie", "dry_run=true")
     assert code == 1
-    assert "scene.path=x/y/ollie: no such folder" in err
-    code, _, err = sweep_here(*scenes)
     assert "scene.path=data/captures/ollie" in err
     assert err.count("docs/study.md says where their photographs are from") == 1
     assert "they belong into data/captures/monstree, data/captures/ollie\n" in err

@@ -1,7 +1,4 @@
-"""Tests of `xrgs-sweep` as a user runs it: a process of its own, which trains in others.
-
-Both are forks of a process that has imported torch (`tests.forks`).
-"""
+"""Tests of `xrgs-sweep` with real trainings, in this process (`tests.conftest.work_here`)."""
 
 from __future__ import annotations
 
@@ -16,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.cli.conftest import SMOKE, SWEEP
+from tests.conftest import SMOKE, SWEEP
 from xrgs.mixture import variant
 from xrgs.safeio.records import read_table
 from xrgs.store.cell_folder import CellFolder
@@ -25,7 +22,6 @@ from xrgs.store.store import Store
 pytestmark = pytest.mark.slow
 
 RunCommand = Callable[..., tuple[int, str, str]]
-SweepHere = RunCommand
 Contents = Callable[[Path], dict[str, str]]
 
 
@@ -50,8 +46,25 @@ def test_a_sweep_ends_with_the_table_and_keeps_all_that_a_reader_may_need(
         assert json.loads((cell / "provenance.json").read_text())["packages"]["torch"]
 
 
+def test_cells_on_another_disk_are_found_by_every_command(
+    swept: tuple[Path, str], sweep_here: RunCommand, call_command: RunCommand, tmp_path: Path
+) -> None:
+    home, table = swept
+    folder = Path(shutil.copytree(home, tmp_path / "copy", symlinks=True))
+    assert (folder / "s" / "cells").is_symlink()
+    words = [word for word in SWEEP if not word.startswith("store=")]
+    code, _, err = sweep_here(*words, f"store={folder / 's'}", "dry_run=true")
+    assert code == 0, err
+    assert "plan: 2 cells, 2 done" in err
+    code, listed, err = call_command("store", "list", f"--store={folder / 's'}")
+    assert code == 0, err
+    assert listed.count("done") == 2
+    assert set(Store(folder / "s").cells()["state"]) == {"done"}
+    assert "Next:" in table
+
+
 def test_a_moved_store_and_naming_the_backend_that_auto_chooses_are_no_change(
-    sweep_here: SweepHere, store: Path
+    sweep_here: RunCommand, store: Path
 ) -> None:
     used = json.loads(next((store / "cells").rglob("provenance.json")).read_text())["backend"]
     store.rename(store.with_name("moved"))
@@ -60,56 +73,6 @@ def test_a_moved_store_and_naming_the_backend_that_auto_chooses_are_no_change(
     assert "plan: 2 cells, 2 done" in err
     if used == "native":
         assert "plan: 2 cells, 0 done" in sweep_here(*arguments, "splat.backend=torch")[2]
-
-
-def test_a_count_matched_cell_has_the_gaussians_of_its_reference(
-    forked_command: RunCommand, store: Path
-) -> None:
-    control = ("+ablation=count_matched", "matched_to=gradient_scaling", *SMOKE, f"store={store}")
-    code, out, err = forked_command("sweep", store.parent, *control)
-    assert code == 0, err
-    assert err.count("training cell") == 2
-    assert "3 of 3 cells done" in err
-    assert "\r" not in err
-    assert "count_matched" in out
-    configs = [json.loads(f.read_text()) for f in store.glob("cells/*/config.json")]
-    matched = [conf["components"]["count_matched"]["gaussians"] for conf in configs]
-    counts = [json.loads(f.read_text())["gaussians"] for f in store.glob("cells/*/summary.json")]
-    assert max(matched) in counts
-
-
-def test_a_corrupt_cell_is_trained_again(
-    forked_command: RunCommand, store: Path, contents: Contents
-) -> None:
-    cell = sorted((store / "cells").iterdir())[0]
-    before = contents(cell)
-    scores = cell / "scores.csv"
-    scores.write_text(scores.read_text().replace("0.", "0.9", 1))
-    code, _, err = forked_command("sweep", store.parent, *SWEEP)
-    assert code == 0
-    assert "corrupt" in err
-    assert "1 done" in err
-    # It is trained again to the same bits; the corrupt folder is kept beside it.
-    assert contents(cell)["splats.ply"] == before["splats.ply"]
-    assert contents(cell)["scores.csv"] == before["scores.csv"]
-    assert cell.with_name(f"{cell.name}.aside-1").is_dir()
-
-
-def test_a_scene_that_fails_leaves_the_other_scenes(
-    forked_command: RunCommand, store: Path, photographs: Callable[..., Path]
-) -> None:
-    flat = photographs(store.parent / "flat", 6)
-    (store.parent / "mine/scene").mkdir(parents=True)
-    text = f"name: flat\nkind: folder\npath: {flat}\n"  # the embedded scene has no path
-    (store.parent / "mine/scene/flat.yaml").write_text(text)
-    scenes = ("scene=motorcycle,flat", "--config-dir", "mine")
-    arguments = ("+ablation=consistency", *SMOKE[1:], *scenes, "store=s")
-    code, out, err = forked_command("sweep", store.parent, *arguments)
-    assert code == 1
-    assert "flat" in err
-    assert "registered" in err
-    assert "failed" in out
-    assert "Training time" in out  # the table of the other scene
 
 
 def test_the_child_imports_the_package_of_its_parent_and_not_that_of_its_folder(
@@ -126,11 +89,6 @@ def test_the_child_imports_the_package_of_its_parent_and_not_that_of_its_folder(
     assert "the wrong package" not in done.stderr
 
 
-def baseline(store: Store) -> CellFolder:
-    (found,) = [row.folder for row in store.cell_rows() if row.label == "baseline"]
-    return found
-
-
 def test_the_curves_of_each_cell_are_tracked(store: Path) -> None:
     for cell in Store(store).cell_folders():
         (file,) = (store / "tracking" / "csv").glob(f"*--{cell.id}.csv")
@@ -141,57 +99,80 @@ def test_the_curves_of_each_cell_are_tracked(store: Path) -> None:
         assert {"score/psnr", "score/gaussians"} <= {row["series"] for row in table}
 
 
-def test_cells_on_another_disk_are_found_by_every_command(
-    swept: tuple[Path, str], forked_command: RunCommand, tmp_path: Path
-) -> None:
-    home, table = swept
-    folder = Path(shutil.copytree(home, tmp_path / "copy", symlinks=True))
-    assert (folder / "s" / "cells").is_symlink()
-    files = [file for file in (home / "disk").rglob("*") if file.is_file()]
-    written = {file: file.stat().st_mtime_ns for file in files}
-    code, again, err = forked_command("sweep", folder, *SWEEP)
-    assert code == 0, err
-    assert "plan: 2 cells, 2 done" in err
-    assert "training cell" not in err
-    assert again == table
-    assert {file: file.stat().st_mtime_ns for file in files} == written
-    code, listed, err = forked_command("store", folder, "list", "--store=s")
-    assert code == 0, err
-    assert listed.count("done") == 2
-    assert set(Store(folder / "s").cells()["state"]) == {"done"}
-    assert "Next:" in table
-
-
-def test_the_same_program_gives_the_same_bits(
-    forked_command: RunCommand, store: Path, tmp_path: Path
-) -> None:
+@pytest.mark.usefixtures("here")
+def test_the_same_program_gives_the_same_bits(sweep_here: RunCommand, store: Path) -> None:
     original = baseline(Store(store)).path
     before = {file: file.stat().st_mtime_ns for file in original.rglob("*")}
-    code, out, err = forked_command("sweep", tmp_path, f"rerun={original}", "out=again")
+    code, out, err = sweep_here(f"rerun={original}", "out=again")
     assert code == 0, out + err
     assert out.startswith("the same, bit for bit: scores.csv, history.csv, splats.ply")
     assert "code, libraries and machine are the same" in err
-    assert f"Written to {tmp_path / 'again'}" in out
-    assert (tmp_path / "again/splats.ply").read_bytes() == (original / "splats.ply").read_bytes()
+    again = store.parent / "again"
+    assert f"Written to {again}" in out
+    assert (again / "splats.ply").read_bytes() == (original / "splats.ply").read_bytes()
     assert {file: file.stat().st_mtime_ns for file in original.rglob("*")} == before
 
 
-def test_a_sweep_goes_on_from_a_packed_store(
-    forked_command: RunCommand, store: Path, tmp_path: Path
-) -> None:
-    cell = baseline(Store(store))
-    built, out = cell.identity().variant, tmp_path / "a.tar.xz"
-    packed = ("pack", cell.id, f"--store={store}", f"--out={out}")
-    assert forked_command("store", tmp_path, *packed)[0::2] == (0, "")
-    with tarfile.open(out) as archive:
+def baseline(store: Store) -> CellFolder:
+    (found,) = [row.folder for row in store.cell_rows() if row.label == "baseline"]
+    return found
+
+
+@pytest.fixture
+def damaged(store: Path, tmp_path: Path, call_command: RunCommand) -> Store:
+    """The unpacked archive of that store, in which the baseline's scores have been changed."""
+    packed = ("pack", f"--store={store}", f"--out={tmp_path / 'a.tar.xz'}")
+    assert call_command("store", *packed)[0::2] == (0, "")
+    with tarfile.open(tmp_path / "a.tar.xz") as archive:
         archive.extractall(tmp_path / "other", filter="data")
-    other = Store((tmp_path / "other" / "xrgs-store").rename(tmp_path / "other" / "s"))
-    assert [path.name for path in other.variants.iterdir()] == [f"trimmed-{built}"]
-    code, table, err = forked_command("sweep", tmp_path / "other", *SWEEP)
-    assert code == 0
-    assert f"variant {built}: making the images again that xrgs-store trim has removed" in err
-    assert "building the mixed-resolution variant" not in err
-    assert err.count("training cell") == 1
+    other = Store((tmp_path / "other" / "xrgs-store").rename(tmp_path / "unpacked"))
+    scores = baseline(other).path / "scores.csv"
+    scores.write_text(scores.read_text().replace("0.", "0.9", 1))
+    return other
+
+
+@pytest.mark.usefixtures("here")
+def test_a_sweep_goes_on_from_a_packed_store_with_a_corrupt_cell_and_a_scene_that_fails(
+    sweep_here: RunCommand,
+    store: Path,
+    damaged: Store,
+    tmp_path: Path,
+    photographs: Callable[..., Path],
+    contents: Contents,
+) -> None:
+    cell = baseline(damaged)
+    built = cell.identity().variant
+    assert [path.name for path in damaged.variants.iterdir()] == [f"trimmed-{built}"]
+    before = contents(store / "cells" / cell.id)
+    text = f"name: flat\nkind: folder\npath: {photographs(tmp_path / 'flat', 6)}\n"
+    (tmp_path / "mine/scene").mkdir(parents=True)
+    (tmp_path / "mine/scene/flat.yaml").write_text(text)  # the embedded scene has no path
+    scenes = ("scene=motorcycle,flat", "--config-dir", "mine", "store=unpacked", "threads=1")
+    arms = ("+ablation=consistency,count_matched", "matched_to=consistency")
+    code, table, err = sweep_here(*arms, *SMOKE[1:], *scenes)
+    assert code == 1  # of the other scene
+    assert "registered" in err
+    assert "failed" in table
+    assert "Training time" in table  # of this scene
     assert "consistency" in table
-    assert [path.name for path in other.variants.glob("[!.]*")] == [built]
-    assert variant.verify(other.variants / built) == []
+    assert "\r" not in err
+    # The images of the trimmed variant are made again, and nothing is built.
+    assert f"variant {built}: making the images again that xrgs-store trim has removed" in err
+    assert err.count("building the mixed-resolution variant") == 1
+    assert [path.name for path in damaged.variants.glob("[!.]*-*") if built[:16] in path.name] == [
+        built
+    ]
+    assert variant.verify(damaged.variants / built) == []
+    # The corrupt cell is trained again to the same bits; the corrupt folder is kept beside it.
+    assert "corrupt" in err
+    assert "1 done" in err
+    assert err.count("training cell") == 2
+    for name in ("splats.ply", "scores.csv"):
+        assert contents(cell.path)[name] == before[name]
+    assert cell.path.with_name(f"{cell.id}.aside-1").is_dir()
+    # The count-matched cell is to reach the Gaussians of its reference.
+    rows = {row.label: row.folder for row in damaged.cell_rows() if row.scene == "motorcycle"}
+    control = rows["count_matched to consistency"]
+    assert control.state().name == "done"
+    count = rows["consistency"].summary().gaussians
+    assert control.config().components.count_matched.gaussians == count

@@ -21,6 +21,7 @@ from xrgs.store.inspect import ALIKE_RECIPE, MIXTURE_RECIPE, Mixture, SfmReport
 from xrgs.store.store import Store
 
 RunCommand = Callable[..., tuple[int, str, str]]
+ACCENT = "e\N{COMBINING ACUTE ACCENT}"
 
 
 @pytest.fixture
@@ -199,39 +200,47 @@ def test_a_dry_run_says_how_many_photographs_there_are_and_writes_nothing(
 
 
 @pytest.mark.slow
-def test_a_scene_is_made_and_its_last_lines_lead_on(
-    forked_command: RunCommand, tmp_path: Path
+@pytest.mark.usefixtures("here")
+def test_a_scene_with_odd_names_is_made_and_its_last_lines_lead_on(
+    call_command: RunCommand, tmp_path: Path
 ) -> None:
-    folder = tmp_path / "my bike"
+    folder = tmp_path / f"部屋 🙂 {{it's}} 50%=#1; {ACCENT}, a"
     folder.mkdir()
-    for file in motorcycle.files().values():
-        shutil.copy(file, folder)
-    small = ("--size", "250", "train.steps=8", "variant.sfm.long_side=500")
-    code, out, err = forked_command("train", tmp_path, "my bike", "--all", *small)
+    views = ['-a b\'s & "c" (1) 🙂', f"[{ACCENT}]=50%#, $x.y"]
+    for name, file in zip(views, motorcycle.files().values(), strict=True):
+        shutil.copy(file, folder / f"{name}.png")
+    store = "st öre, 'a' {b} 🙂"
+    given = (folder.name, "--all", "--size", "250", "train.steps=8", "--store", store)
+    small = (*given, "variant.sfm.long_side=500")
+    code, out, err = call_command("train", *small)
     assert code == 0, err
     lines = out.splitlines()
-    assert lines[0] == "my bike: 2 photographs found"
+    assert lines[0] == f"{folder.name}: 2 photographs found"
     end = lines[-8:]
-    assert end[0] == "my bike: 2 of 2 photographs are placed"
+    assert end[0] == f"{folder.name}: 2 of 2 photographs are placed"
     assert end[1].endswith(" dB on 2 photographs that it was trained on")
     assert "Gaussians after 8 steps; all took " in end[2]
     page = tmp_path / end[3].removeprefix("Page: ")
     assert page.name == "report.html"
     assert page.is_file()
     assert end[4] == "Next:"
-    assert end[5] == "  xrgs-view 'my bike'"
-    assert end[7].startswith("  xrgs-data export 'my bike' --out ")
+    quoted = f"{shlex.quote(folder.name)} --store {shlex.quote(store)}"
+    assert end[5] == f"  xrgs-view {quoted}"
+    assert end[7].startswith("  xrgs-data export ")
     assert "plan:" not in err  # a study's words
-    (cell,) = Store(tmp_path / "xrgs-store").cell_folders()
+    (cell,) = Store(tmp_path / store).cell_folders()
     assert cell.state().name == "done"
+    assert {file.stem for file in (cell.path / "renders").iterdir()} == set(views)
 
-    code, out, err = forked_command("train", tmp_path, "my bike", "--all", *small, "--out=a.ply")
+    code, out, err = call_command("train", *small, "--out=a.ply")
     assert code == 0, err  # found again, and exported by its name
     assert "training" not in err + out
     assert f"trained already by {ALIKE_RECIPE}: 8 steps at 250 px\n" in out
     assert out.splitlines()[-1].endswith("written to a.ply")
-    assert forked_command("data", tmp_path, "export", "my bike", "--out", "b.ply")[0] == 0
+    export = ("export", folder.name, "--out", "b.ply", "--store", store)
+    assert call_command("data", *export)[0] == 0
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+    assert folder.name in call_command("status", "--store", store)[1]
 
 
 @pytest.mark.slow

@@ -2,40 +2,44 @@
 
 from __future__ import annotations
 
-import os
 import signal
-import subprocess
-import sys
 import urllib.request
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 
+from xrgs.cli import view
 from xrgs.formats.ply import save_ply
+from xrgs.runtime.signals import StopSignal
 from xrgs.splat.gaussians import Gaussians
 
 
 @pytest.mark.slow
-def test_ctrl_c_ends_it_in_order(tmp_path: Path) -> None:
+def test_ctrl_c_ends_it_in_order(
+    call_command: Callable[..., tuple[int, str, str]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """In place of waiting, the page is read, and then comes the signal."""
     points = torch.rand(9, 3, generator=torch.Generator().manual_seed(0))
     save_ply(tmp_path / "a.ply", Gaussians.from_points(points, points))
-    command = [sys.executable, "-P", "-c", "from xrgs.cli.view import main; main()", "a.ply"]
-    with subprocess.Popen(
-        [*command, "--port", "0", "--limit", "5"],
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONUNBUFFERED": "1"},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    ) as process:
-        assert process.stdout is not None
-        assert process.stderr is not None
-        lines = [process.stdout.readline(), process.stdout.readline()]
-        assert lines[0] == "a.ply: the 5 most opaque of 9 Gaussians (--limit 5)\n"
-        address = lines[1].split()[1]
-        with urllib.request.urlopen(address, timeout=10) as page:  # noqa: S310 - of this machine
+
+    def wait() -> None:
+        first, second = capsys.readouterr().out.splitlines()[-2:]
+        assert first == "a.ply: the 5 most opaque of 9 Gaussians (--limit 5)"
+        with urllib.request.urlopen(second.split()[1], timeout=10) as page:  # noqa: S310 - local
             assert b"<iframe" in page.read()
-        process.send_signal(signal.SIGINT)
-        assert process.wait(30) == 0
-        assert "Traceback" not in process.stderr.read()
+        raise StopSignal(signal.SIGINT)
+
+    events = SimpleNamespace(Event=lambda: SimpleNamespace(wait=wait))
+    monkeypatch.setattr(view, "threading", events)
+    try:
+        code, out, err = call_command("view", "a.ply", "--port", "0", "--limit", "5")
+    except StopSignal:  # which would end all tests
+        pytest.fail("nobody has handled the signal")
+    assert (code, out) == (0, ""), err
+    assert "Traceback" not in err

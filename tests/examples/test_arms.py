@@ -4,23 +4,28 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 import shutil
 import subprocess
 import sys
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+
+import xrgs.report
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "arms"
 NAME = "skip_backward"
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("here")
 def test_it_is_swept_and_trained_again_only_where_it_is_named(
-    tmp_path: Path, smoke_variants: Path, forked_command: Callable[..., tuple[int, str, str]]
+    tmp_path: Path,
+    smoke_variants: Path,
+    sweep_here: Callable[..., tuple[int, str, str]],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     # From a copy: pip may leave files in the folder that it builds.
     source, site = shutil.copytree(EXAMPLE, tmp_path / "arms"), tmp_path / "site"
@@ -29,19 +34,16 @@ def test_it_is_swept_and_trained_again_only_where_it_is_named(
     target = ["--no-build-isolation", "--no-index", "--target", str(site)]
     subprocess.run([*pip, *target, str(source)], check=True, capture_output=True)
     shutil.copytree(smoke_variants, tmp_path / "s" / "variants")
-    path = os.pathsep.join(filter(None, [str(site), os.environ.get("PYTHONPATH", "")]))
-    run = partial(forked_command, PYTHONPATH=path)
-    code, out, err = run(
-        *("sweep", tmp_path, "--config-dir", str(source / "conf"), f"+ablation={NAME}"),
+    monkeypatch.syspath_prepend(site)
+    monkeypatch.setattr(xrgs.report, "build", lambda *_: SimpleNamespace(text=""))
+    code, _, err = sweep_here(
+        *("--config-dir", str(source / "conf"), f"+ablation={NAME}"),
         *("scene=motorcycle", "preset=smoke", "train.steps=4", "threads=1", "store=s"),
+        "baseline=false",
     )
     assert code == 0, err
-    assert out.startswith(f"{NAME} against baseline")
-    (cell,) = (
-        file.parent
-        for file in (tmp_path / "s" / "cells").glob("*/identity.json")
-        if "plugins" in json.loads(file.read_text())["components"]
-    )
+    (cell,) = (tmp_path / "s" / "cells").iterdir()
+    assert NAME in json.loads((cell / "identity.json").read_text())["components"]["plugins"]
     with (cell / "history.csv").open() as file:
         *_, third, last = csv.DictReader(file)
     # Two steps after densification, on views that had no such step before: none is skipped.
@@ -50,11 +52,11 @@ def test_it_is_swept_and_trained_again_only_where_it_is_named(
         {"", "0.0"},
     ]
     # A store must not decide which installed package is imported.
-    rerun = ("sweep", tmp_path, f"rerun={cell}", "out=again")
-    code, _, err = run(*rerun)
+    rerun = (f"rerun={cell}", "out=again")
+    code, _, err = sweep_here(*rerun)
     assert code == 1
     assert f"add plugins={NAME}" in err
     assert not (tmp_path / "again").exists()
-    code, out, err = run(*rerun, f"plugins={NAME}")
+    code, out, err = sweep_here(*rerun, f"plugins={NAME}")
     assert code == 0, err
     assert out.startswith("the same, bit for bit")

@@ -86,25 +86,23 @@ def test_photographs_are_trained(
 
 @pytest.mark.slow
 def test_two_recipes_are_compared_and_filmed(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    smoke_variants: Path,
-    forked_command: Callable[..., tuple[int, str, str]],
+    tmp_path: Path, swept: tuple[Path, str], call_command: Callable[..., tuple[int, str, str]]
 ) -> None:
-    shutil.copytree(smoke_variants, tmp_path / "xrgs-store" / "variants")
-    monkeypatch.chdir(tmp_path)
-    commands = []
+    """With the cells of another sweep; its own is planned."""
+    shutil.copytree(swept[0] / "s", tmp_path / "xrgs-store")
+    plans: list[str] = []
 
     def system(line: str) -> None:
         name, *arguments = shlex.split(line)
-        commands.append(name)
-        code, _, err = forked_command(name.removeprefix("xrgs-"), tmp_path, *arguments)
+        dry = ["dry_run=true"] * (name == "xrgs-sweep")
+        code, _, err = call_command(name.removeprefix("xrgs-"), *arguments, *dry)
         assert code == 0, err
+        plans.extend(line for line in err.splitlines() if dry and line.startswith("plan:"))
 
-    smaller = {"preset=smoke": "preset=smoke train.steps=20", "views 12": "views 2"}
+    smaller = {r'\["plus"\]': '["consistency"]', "views 12": "views 2"}
     _, values = run(changed(sources("compare_recipes"), smaller), system)
-    assert commands == ["xrgs-sweep", "xrgs-render"]
+    assert [plan.partition(",")[0] for plan in plans] == ["plan: 3 cells"]
     scores, changes = (value for value in values if hasattr(value, "columns"))
-    assert set(scores.index) == {"baseline", "lean", "plus"}
-    assert [*changes.columns] == ["lean", "plus"]
+    assert set(scores.index) == {"baseline", "consistency"}
+    assert [*changes.columns] == ["consistency"]
     assert (tmp_path / "film.mp4").stat().st_size > 1000

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 from collections.abc import Callable, Mapping
 from copy import deepcopy
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import hydra
@@ -15,6 +18,7 @@ import pytest
 from hydra.types import HydraContext
 from omegaconf import DictConfig
 
+import xrgs.report
 from xrgs import config
 from xrgs.config import Conf
 from xrgs.runtime import lease
@@ -62,6 +66,32 @@ def finish(store: Store, name: str) -> None:
     cell = store.cell(name)
     (cell.path / "scores.csv").write_text("view\na\n")
     cell.finish(["a"], {})
+
+
+@pytest.fixture
+def faulty(
+    sweep_here: Callable[..., tuple[int, str, str]],
+    smoke_variants: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> Callable[[str], Callable[..., tuple[int, str, str]]]:
+    """(Python code) -> the function (*overrides) that runs a smoke sweep in this process.
+
+    All processes that it starts run the code first. The test's folder has the store `s` with the
+    variant, and no report is made.
+    """
+
+    def made(code: str) -> Callable[..., tuple[int, str, str]]:
+        shutil.copytree(smoke_variants, tmp_path / "s" / "variants")
+        (tmp_path / "site").mkdir()
+        (tmp_path / "site" / "sitecustomize.py").write_text(code)
+        path = [str(tmp_path / "site"), os.environ.get("PYTHONPATH", "")]
+        monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, path)))
+        monkeypatch.setenv("SWEEPS_OF", str(tmp_path))
+        monkeypatch.setattr(xrgs.report, "build", lambda *_: SimpleNamespace(text=""))
+        return partial(sweep_here, "scene=motorcycle", "preset=smoke", "store=s")
+
+    return made
 
 
 @pytest.fixture

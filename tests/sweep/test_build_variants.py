@@ -261,16 +261,17 @@ def test_variants_are_built_at_once_on_shares_of_the_cores(
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("here")
 def test_sweeps_of_a_scene_that_sfm_can_not_place(
-    forked_command: Callable[..., tuple[int, str, str]], tmp_path: Path
+    sweep_here: Callable[..., tuple[int, str, str]], tmp_path: Path
 ) -> None:
     photographs(tmp_path / "leaves", 3, (40, 30))  # SIFT finds no feature in a flat image
     scene = ("scene=folder", "scene.path=leaves", "preset=smoke", "store=s", *CONF)
-    code, table, err = forked_command("sweep", tmp_path, *scene)
+    code, table, err = sweep_here(*scene)
     assert code == 1
     assert BUILDING in err
     assert "0 of 3 photographs are placed" in table
-    code, second_table, err = forked_command("sweep", tmp_path, *scene)
+    code, second_table, err = sweep_here(*scene)
     assert code == 1
     assert second_table == table
     assert BUILDING not in err

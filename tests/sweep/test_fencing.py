@@ -5,39 +5,20 @@ from __future__ import annotations
 import os
 import shutil
 import signal
-import subprocess
-import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
 from tests.sweep.conftest import VARIANT, content
 from xrgs.config import Conf
-from xrgs.safeio.atomic import write_json
 from xrgs.splat.backend import resolve_backend
 from xrgs.store.attempts import begin_attempt, plan_cell
 from xrgs.store.cell_folder import CellFolder
 from xrgs.store.identity import cell_identity
 from xrgs.store.store import Store
 from xrgs.sweep import job
-
-#: Runs a worker that stops itself right before it writes a cell's status.
-STOPPED = """
-import os, signal, sys
-from pathlib import Path
-replace = Path.replace
-
-def stopping(path, target):
-    if str(target).endswith("status.json"):
-        Path.replace = replace
-        os.kill(os.getpid(), signal.SIGSTOP)
-    return replace(path, target)
-
-Path.replace = stopping
-from xrgs.sweep import job
-job.main("cell", *sys.argv[1:])
-"""
 
 
 @pytest.fixture
@@ -58,26 +39,48 @@ def begin(compose: Callable[..., Conf], tmp_path: Path) -> Callable[[str], CellF
     return begun
 
 
+@contextmanager
+def process_kept() -> Iterator[None]:
+    """Give this process back its output and its handler of SIGTERM after a block."""
+    handler, streams = signal.getsignal(signal.SIGTERM), [(os.dup(n), n) for n in (1, 2)]
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, handler)
+        for kept, number in streams:
+            os.dup2(kept, number)
+            os.close(kept)
+
+
 @pytest.mark.slow
 def test_a_worker_that_wakes_up_after_a_takeover_writes_into_its_own_folder_alone(
-    begin: Callable[[str], CellFolder], smoke_variants: Path, tmp_path: Path
+    begin: Callable[[str], CellFolder],
+    smoke_variants: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    """It sleeps right before it writes the cell's status, while another finishes the cell."""
     (built,) = smoke_variants.iterdir()
-    cell = begin(built.name)
-    write_json(tmp_path / "request", job.cell_request(built, cell))
-    arguments = [str(tmp_path / "request"), str(tmp_path / "answer")]
-    child = subprocess.Popen([sys.executable, "-P", "-c", STOPPED, *arguments])
-    assert os.WIFSTOPPED(os.waitpid(child.pid, os.WUNTRACED)[1])
+    cell, own, replace = begin(built.name), tmp_path / "own", Path.replace
+    request, before = job.cell_request(built, cell), {}
 
-    own = tmp_path / "own"
-    cell.path.rename(own)  # a test can look into it; an attempt would remove it
-    plan_cell(cell, CellFolder(own).config(), CellFolder(own).identity())
-    begin_attempt(cell)
-    (cell.path / "scores.csv").write_text("view\na\n")
-    cell.finish(["a"], {})
-    before = content(cell.path)
-    child.send_signal(signal.SIGCONT)
-    child.wait(60)
+    def replace_late(path: Path, target: Path) -> Path:
+        if Path(target).name == "status.json":
+            monkeypatch.setattr(Path, "replace", replace)
+            cell.path.rename(own)  # a test can look into it; an attempt would remove it
+            plan_cell(cell, CellFolder(own).config(), CellFolder(own).identity())
+            begin_attempt(cell)
+            (cell.path / "scores.csv").write_text("view\na\n")
+            cell.finish(["a"], {})
+            before.update(content(cell.path))
+        return replace(path, target)
+
+    monkeypatch.setattr(Path, "replace", replace_late)
+    monkeypatch.chdir(tmp_path)  # which is left at the end
+    monkeypatch.setattr(job, "log_to_stderr", lambda *_: None)
+    with process_kept():
+        job._WORK["cell"](request)
+    assert before
     assert content(cell.path) == before
     assert cell.state().name == "done"
     assert CellFolder(own).state().name == "done"  # where nobody looks any more

@@ -17,6 +17,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from tests.sweep.conftest import content
+from xrgs.config import LimitsConf
 from xrgs.errors import XrgsError
 from xrgs.mixture import variant
 from xrgs.photos import scenes
@@ -73,7 +74,10 @@ def requests(monkeypatch: pytest.MonkeyPatch, cells: Cells) -> list[tuple[str, M
     """What child processes were asked to do; none is started, and each cell is done at once."""
     requested: list[tuple[str, Mapping[str, Any]]] = []
 
-    def finish(job: str, request: Mapping[str, Any], *_: object) -> dict[str, Any]:
+    def finish(
+        job: str, request: Mapping[str, Any], limits: LimitsConf, *_: object
+    ) -> dict[str, Any]:
+        assert limits == cells.store.cell(request["id"]).config().limits
         requested.append((job, request))
         cells.finish(cells.store.cell(request["id"]))
         return {"found": ["formation: LR views: 0.83 px of blur across, 0.84 down"]}
@@ -88,7 +92,7 @@ def test_a_job_trains_what_was_planned_and_reads_no_photograph(
     requests: list[tuple[str, Mapping[str, Any]]],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    cell = cells.plan(seed=5)
+    cell = cells.plan(seed=5, limits=LimitsConf(minutes=7.0, memory_gb=0.0))
     planned = cell.config(), cell.identity()
 
     def unexpected(*_: object) -> None:

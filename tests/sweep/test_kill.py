@@ -1,7 +1,8 @@
-"""Tests that a sweep killed by `kill -9` at random moments ends as if it had not been killed.
+"""Tests that a sweep killed by `kill -9` ends as if it had not been killed.
 
-`XRGS_KILLS=20 pytest tests/sweep/test_kill.py --log-cli-level=info` kills 20 times and logs
-each; with `XRGS_KILL_SEED=N` besides, it draws the same moments as the run that printed this seed.
+`XRGS_KILLS=20 pytest tests/sweep/test_kill.py -m exhaustive --log-cli-level=info` kills 20 times at
+random moments and logs each; with `XRGS_KILL_SEED=N` besides, it draws the same moments as the run
+that printed this seed.
 """
 
 from __future__ import annotations
@@ -16,14 +17,18 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tests.conftest import work_here
 from xrgs.store import cell
 from xrgs.store.attempts import begin_attempt, plan_cell
 from xrgs.store.cell_folder import CellFolder
+from xrgs.store.store import Store
+from xrgs.sweep import job
 
 pytestmark = pytest.mark.slow
 
@@ -189,6 +194,57 @@ def results(folder: Path) -> dict[str, Any]:
     }
 
 
+#: A cell's child kills itself soon after its first checkpoint; it needs no Hydra.
+KILLED = """
+import sys
+if "xrgs.sweep.job" in sys.orig_argv and "cell" in sys.orig_argv:
+    import os, signal, threading, time
+    from pathlib import Path
+
+    def kill():
+        while not Path("checkpoint.npz").exists():
+            time.sleep(0.001)
+        imported = sys.modules.keys() & {"hydra", "omegaconf"}
+        Path(os.environ["SWEEPS_OF"], "imported").write_text(str(imported or "neither"))
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    threading.Thread(target=kill, daemon=True).start()
+"""
+
+
+def as_if_spared(folder: CellFolder, home: Path) -> bool:
+    """Whether a cell has the results of one that is trained without a break."""
+    spared = CellFolder(home / folder.id)
+    plan_cell(spared, folder.config(), folder.identity())
+    begin_attempt(spared)
+    cell.run_cell(folder.config(), folder.variant(), spared)
+    return results(folder.path) == results(spared.path)
+
+
+def test_a_cell_whose_process_is_killed_is_continued_from_its_checkpoint(
+    faulty: Callable[[str], Callable[..., tuple[int, str, str]]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    sweep = partial(faulty(KILLED), *ARGUMENTS[2:], "baseline=false", "threads=1")
+    code, _, err = sweep()
+    assert code == 1, err
+    assert "SIGKILL" in err
+    assert (tmp_path / "imported").read_text() == "neither"
+    monkeypatch.setattr(job, "run_in_child", work_here)
+    with caplog.at_level(logging.INFO):
+        code, _, err = sweep()
+    assert code == 0, err
+    assert err.count("training cell") == 1
+    assert "going on from the checkpoint" in caplog.text
+    (folder,) = Store(tmp_path / "s").cell_folders()
+    assert as_if_spared(folder, tmp_path)
+    for pattern in ("cells/*/.*", "cells/*/checkpoint.npz", "locks/[!.]*"):
+        assert not list((tmp_path / "s").glob(pattern))
+
+
+@pytest.mark.exhaustive
 def test_a_sweep_killed_again_and_again_ends_as_if_it_had_not_been(
     sweeps_in: Callable[..., Any],
     smoke_variants: Path,
@@ -222,12 +278,7 @@ def test_a_sweep_killed_again_and_again_ends_as_if_it_had_not_been(
     killed.check()
     assert len(killed.finished) == CELLS
 
-    for folder in map(CellFolder, killed.done()):
-        spared = CellFolder(tmp_path / folder.id)
-        plan_cell(spared, folder.config(), folder.identity())
-        begin_attempt(spared)
-        cell.run_cell(folder.config(), folder.variant(), spared)
-        assert results(folder.path) == results(spared.path)
+    assert all(as_if_spared(folder, tmp_path) for folder in map(CellFolder, killed.done()))
     logs = [(done / "log.txt").read_text() for done in killed.done()]
     assert any("going on from the checkpoint" in log for log in logs)
     for pattern in ("cells/*/.*", "cells/*/checkpoint.npz", "locks/[!.]*"):
