@@ -37,20 +37,35 @@ def test_import_is_light() -> None:
     assert python(f"{script}; {light}; print('torch' in sys.modules)").stdout == "\nFalse\n"
 
 
-@pytest.mark.slow
+#: Stands for an import of torch, which takes seconds.
+IMPORTED = "sys.modules['torch'] = None"
+#: Prints whether the warning is still due, after a name that renders nothing and after others.
+USED = f"""
+{IMPORTED}
+for names in ("load_gaussians",), ("train", "rasterize", "train"):
+    for name in names:
+        try:
+            getattr(xrgs, name)
+        except ImportError as error:
+            assert error.name == "torch", error
+    print(xrgs._SPINNING)
+"""
+
+
 def test_openmps_threads_sleep_unless_the_environment_says_otherwise() -> None:
-    done = python("import os, xrgs; print(os.environ['OMP_WAIT_POLICY']); xrgs.rasterize")
-    assert (done.stdout.split(), done.stderr) == (["passive"], "")
+    done = python(f"import os, sys, xrgs; print(os.environ['OMP_WAIT_POLICY'])\n{USED}")
+    assert (done.stdout.split(), done.stderr) == (["passive", "False", "False"], "")
     done = python("import os, xrgs; print(os.environ['OMP_WAIT_POLICY'])", OMP_WAIT_POLICY="active")
     assert (done.stdout.split(), done.stderr) == (["active"], "")
 
 
-@pytest.mark.slow
 def test_torch_before_xrgs_is_warned_of_once_where_something_renders() -> None:
-    script = "import torch, xrgs; xrgs.load_gaussians; xrgs.train; xrgs.rasterize; xrgs.train"
-    done = python(script)
+    script = f"import sys; {IMPORTED}; import xrgs\n"
+    done = python(script + USED)
+    assert done.stdout.split() == ["True", "False"]
     assert done.stderr.count("import xrgs before torch, or set OMP_WAIT_POLICY=passive") == 1
-    assert python(script, OMP_WAIT_POLICY="passive").stderr == ""
+    done = python(f"{script}print(xrgs._SPINNING)", OMP_WAIT_POLICY="passive")
+    assert done.stdout.split() == ["False"]
 
 
 def test_a_name_that_will_go_works_and_says_what_to_use() -> None:

@@ -91,8 +91,8 @@ def sfm_conf(configured: Callable[..., VariantConf]) -> SfmConf:
 
 @pytest.fixture(scope="session")
 def procedural_scene() -> SceneConf:
-    """The embedded multi-view scene, 16 views."""
-    return scene_conf("procedural", name="procedural", views=16)
+    """The embedded multi-view scene, 12 views."""
+    return scene_conf("procedural", name="procedural", views=12)
 
 
 @pytest.fixture(scope="session")

@@ -73,19 +73,27 @@ def test_both_processes_are_started_anew_after_a_few_repetitions(
 
 
 @pytest.mark.slow
-def test_an_installation_is_compared_with_itself(tmp_path: Path) -> None:
+def test_this_installation_is_compared_with_one_that_takes_a_ms_for_anything(
+    tmp_path: Path,
+) -> None:
     if resolve_backend("auto") != "native":
         pytest.skip("the native backend was not built")
-    python = Path(sys.executable)
-    settings = Settings(smoke=True, repeats=2, threads=2, out=tmp_path, against=python)
+    python = tmp_path / "python"
+    python.write_text(
+        '#!/bin/sh\nread setup\necho \'{"package": "theirs", "isa": "slow"}\'\n'
+        "while read task; do echo '{\"ms\": 1}'; done\n"
+    )
+    python.chmod(0o755)
+    settings = Settings(smoke=True, repeats=1, threads=2, out=tmp_path / "o", against=python)
     text = run.run(settings)
-    with (tmp_path / "against.csv").open(newline="") as file:
+    with (tmp_path / "o" / "against.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     tasks = (RENDER, HR_STEP, LR_STEP, MEAN_STEP)
     cases = [(task, count) for task in tasks for count in "12"]
     assert [(row["task"], row["threads"]) for row in rows] == cases
-    assert all(float(row[f"{side}_ms"]) > 0 for row in rows for side in SIDES)
-    for word in (*tasks, "times faster", "speed-up", "300 Gaussians at 80x60"):
+    assert all(float(row["this_ms"]) > 0 for row in rows)
+    assert all(float(row["other_ms"]) == 1 for row in rows)
+    for word in (*tasks, "times faster", "speed-up", "300 Gaussians at 80x60", "theirs, slow"):
         assert word in text
 
 

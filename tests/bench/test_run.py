@@ -101,7 +101,8 @@ def test_the_files_hold_the_results(smoke: Smoke) -> None:
 
 
 @pytest.mark.slow
-def test_a_file_is_timed(file: Path, tmp_path: Path) -> None:
+def test_a_file_is_timed(file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run.plot, "draw", lambda _: b"")  # half of the time
     settings = Settings(load=file, out=tmp_path / "o", json=tmp_path / "a.json")
     settings.repeats = settings.threads = 1
     text = run.run(settings)

@@ -111,8 +111,8 @@ def test_any_number_of_threads_gives_the_same_cameras(
 
     One run of some 90 had other last digits, for a reason inside COLMAP.
     """
-    conf = compose("scene=procedural", "scene.views=6")
-    rendered = scenes.resolve(conf.scene, tmp_path, 320).files.values()
+    conf = compose("scene=procedural", "scene.views=5")
+    rendered = scenes.resolve(conf.scene, tmp_path, 252).files.values()
     models = []
     for threads in (1, 3):
         monkeypatch.setattr(sfm, "usable_cores", lambda threads=threads: threads)
@@ -123,7 +123,7 @@ def test_any_number_of_threads_gives_the_same_cameras(
         inputs = [sfm.SfmImage(file.name, file.stem, "all") for file in rendered]
         models.append(sfm.reconstruct(inputs, work, work, conf.variant.sfm))
     one, three = models
-    assert one.report["registered"] == 6
+    assert one.report["registered"] == 5
     first, second = ({str(i): pose for i, pose in model.viewmats.items()} for model in models)
     assert pose_error(second, first)["position_percent_max"] < 0.01
     assert three.lenses[0].params[0] == pytest.approx(one.lenses[0].params[0], rel=1e-4)

@@ -38,16 +38,16 @@ def test_every_8th_view_is_held_out_and_a_fraction_of_the_rest_stays_hr(
     assert made.held_out
     assert made.factor == 5
     assert [v.name for v in select(made, "test", "HR")] == ["view_000", "view_008"]
-    assert len(select(made, "train", "HR")) == round(0.3 * 14)
-    assert len(select(made, "train", "LR")) == 14 - round(0.3 * 14)
-    assert len([v for v in made.views if v.split != "original"]) == 16
+    assert len(select(made, "train", "HR")) == round(0.3 * 10)
+    assert len(select(made, "train", "LR")) == 10 - round(0.3 * 10)
+    assert len([v for v in made.views if v.split != "original"]) == 12
     assert [(v.split, v.name) for v in made.views] == sorted((v.split, v.name) for v in made.views)
 
 
 def test_the_cameras_are_the_exact_ones_up_to_a_similarity(procedural_variant: Variant) -> None:
-    """At 250 px, 0.8% and 0.17 degrees were measured; all HR, intrinsics known, gives 0.46%."""
+    """At 250 px, 1.0% and 0.29 degrees were measured, with 16 views 0.8% and 0.35 degrees."""
     error = procedural_variant.report["pose_error"]
-    assert procedural_variant.report["registered"] == 16
+    assert procedural_variant.report["registered"] == 12
     assert error["position_percent"] < 1.5
     assert error["rotation_degrees"] < 0.4
 
@@ -72,7 +72,7 @@ def test_the_report_says_how_sfm_went(procedural_variant: Variant) -> None:
     assert len(procedural_variant.points) == len(procedural_variant.colors)
     assert 0 < report["reprojection_error_px"] < 1.5
     assert report["not_registered"] == []
-    assert report["hr_sizes"] == {"250x185": 16}
+    assert report["hr_sizes"] == {"250x185": 12}
     assert report["seconds"] > 0
     assert "Feature extraction" in (procedural_variant.folder / "colmap.log").read_text()
 
@@ -109,14 +109,14 @@ def test_one_pose_at_two_sizes_shows_one_image(stereo_variant: Variant) -> None:
 def test_photographs_of_fern_are_registered_at_a_reduced_size(
     build: Build, data_root: Path, tmp_path: Path
 ) -> None:
-    files = sorted((data_root / "llff" / "fern" / "images_4").glob("*"))[:6]
+    files = sorted((data_root / "llff" / "fern" / "images_4").glob("*"))[:4]
     if not files:
         pytest.skip("fern is not there")
     for file in files:
         images.save(tmp_path / "fern" / f"{file.stem}.png", images.read(file))
     few = {"max_num_features": 1500, "long_side": 504}
     built = build(scene_conf("folder", tmp_path / "fern", name="fern"), sfm=few)
-    assert built.report["registered"] == 6
+    assert built.report["registered"] == 4
     assert len(select(built, "test", "HR")) == 1
     assert {(v.width, v.height) for v in select(built, "train", "LR")} == {(50, 37)}
     assert len(built.points) > 100

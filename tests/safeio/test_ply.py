@@ -49,7 +49,7 @@ def tables(draw: st.DrawFn, *, may_have_lists: bool = True) -> NDArray[np.void]:
 )
 @pytest.mark.filterwarnings("ignore:loadtxt")  # plyfile reads a list of no entries so
 @settings(
-    max_examples=100,
+    max_examples=50,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 def test_what_plyfile_writes_is_read(

@@ -20,7 +20,7 @@ from xrgs.splat.gaussians import PARAMETERS
 from xrgs.training.dataset import Dataset, LoadedView
 from xrgs.training.loop import train
 
-GAUSSIANS = 60_001
+GAUSSIANS = 33_001
 """Above 32,768, from which on torch divides a tensor among its threads; of no round number, so that
 the parts have tails."""
 _BOTH = (
@@ -61,7 +61,7 @@ _MCMC = (
     # Opacities begin where some die and many move by noise.
     "splat.init_opacity=0.05",
     "splat.densify.prune_opacity=0.045",
-    "splat.densify.budget=28",  # 64,512 Gaussians
+    "splat.densify.budget=16",  # 36,864 Gaussians
 )
 #: What each strategy is trained with, and the counts of a refinement that must not be 0.
 _CASES = {

@@ -13,9 +13,8 @@ from xrgs.training.loop import train
 
 #: Densification every fourth step: every single step, as the schedule of so few steps has it, would
 #: leave no statistics to be restored.
-SHORT = ("train.steps=24", "splat.densify.every=5000", "splat.densify.stop=25000")
+SHORT = ("train.steps=16", "splat.densify.every=7500", "splat.densify.stop=25000")
 CASES = {
-    "baseline": (),
     # 60 Gaussians of at most 180: a limit that began with those at the restart would be another.
     "xrgs": (
         "+ablation=[xrgs_per_class,curriculum,harmonics_every,budget]",

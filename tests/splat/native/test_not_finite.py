@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
-from tests.runtime.programs import run_python
+from tests.splat.native import fuzz_rasterizer
 from tests.splat.scenes import draw
 from xrgs.splat.cameras import Camera
 from xrgs.splat.settings import RasterSettings
@@ -176,17 +175,12 @@ def test_a_camera_that_float32_does_not_hold_is_named() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [500, pytest.param(10000, marks=pytest.mark.exhaustive)])
-def test_fuzzing(count: int) -> None:
-    # In a process of its own, so that a crash is a failure of this test alone. The repository comes
-    # last on its path, so that the installed package is tested.
-    code = (
-        "import sys; sys.path.append(sys.argv.pop())\n"
-        "from tests.splat.native.fuzz_rasterizer import main; sys.exit(main(sys.argv[1:]))"
-    )
-    result = run_python(code, "--count", str(count), str(Path(__file__).parents[3]))
-    assert result.returncode == 0, result.stdout + result.stderr
-    refused = int(result.stdout.split(f"{count} scenes, ")[1].split(" ")[0])
+@pytest.mark.parametrize("count", [300, pytest.param(10000, marks=pytest.mark.exhaustive)])
+def test_fuzzing(count: int, capsys: pytest.CaptureFixture[str]) -> None:
+    code = fuzz_rasterizer.main(["--count", str(count)])
+    out = capsys.readouterr().out
+    assert code == 0, out
+    refused = int(out.split(f"{count} scenes, ")[1].split(" ")[0])
     # Sizes beyond 1e18 px are asked for by some cases; of the others an error is no way out.
-    too_large = re.findall(r"(\d+) from seed \d+: scales: a Gaussian is larger", result.stdout)
+    too_large = re.findall(r"(\d+) from seed \d+: scales: a Gaussian is larger", out)
     assert 0 < refused - sum(map(int, too_large)) < 0.03 * count

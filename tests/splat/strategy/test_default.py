@@ -117,7 +117,7 @@ def test_a_run_of_3000_steps_is_gsplats() -> None:
     values = random_start(150, rng)
     ours, theirs = make_both(values, config, 1)
     total: dict[str, int] = {}
-    for step in range(steps):
+    for step in range(config.stop + 200):
         count = len(ours.gaussians)
         if step < config.stop:  # nothing changes after it
             gradients = random_gradients(vars(ours.gaussians), rng)

@@ -64,13 +64,14 @@ def true_depths(rays: Array, viewmat: Array) -> Array:
     return nearest
 
 
-def true_scene(count: int, width: int, samples: int = 1) -> TrueScene:
+def true_scene(count: int, width: int, samples: int = 1, part: slice = slice(None)) -> TrueScene:
     """Render views of the embedded scene, `width` px wide, two thirds at `FACTOR` times less.
 
-    A pixel of an HR view has the mean of `samples` x `samples`.
+    Of `count` views only a part is rendered, by default all. A pixel of an HR view has the mean of
+    `samples` x `samples`.
     """
     height = width * 3 // 4
-    K, viewmats = procedural.intrinsics(width, height), procedural.viewmats(count)
+    K, viewmats = procedural.intrinsics(width, height), procedural.viewmats(count)[part]
     textures = {name: still_life._pyramid(*of) for name, of in procedural.TEXTURES.items()}
     images = [
         still_life.render(
