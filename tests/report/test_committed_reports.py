@@ -25,8 +25,8 @@ RunCommand = Callable[..., tuple[int, str, str]]
 
 REPORTS = Path(__file__).parents[2] / "reports"
 PACKS = sorted(REPORTS.rglob("store.tar.xz"))
-#: Without the race, whose table is not of `xrgs-report`: tests/bench/test_race.py makes it again.
 SMALL = {"captures", "embedded", "fast", "trainer"}
+#: Without the race, whose table is not of `xrgs-report`: tests/bench/test_race.py makes it again.
 STUDIES = [
     pytest.param(study, marks=() if study in SMALL else pytest.mark.exhaustive)
     for study in sorted({pack.parent.relative_to(REPORTS).parts[0] for pack in PACKS} - {"race"})
