@@ -6,7 +6,7 @@ from tests.report.conftest import MadeStore
 from xrgs.evaluation.metrics import METRICS
 from xrgs.report.collect import Choice, ReportStore, read_cells
 from xrgs.report.compare import compare
-from xrgs.report.mixed import other_code, other_settings
+from xrgs.report.mixed import fewer_replicates, other_code, other_settings
 
 
 def warnings(made: MadeStore, sweep_ids: list[str], *scenes: str) -> list[str]:
@@ -45,3 +45,17 @@ def test_a_baseline_of_another_sweep_with_other_settings_is_named(made: Any) -> 
     (warning,) = warnings(made, [first, other])
     assert "lean is compared with the baseline of a sweep with another command" in warning
     assert "they differ in train.steps 600, 500:" in warning
+
+
+def test_labels_with_other_replicates_are_named(made: Any) -> None:
+    for scene, seeds in (("fern", (0, 1)), ("horns", (0,))):
+        for seed in seeds:
+            made.add(scene=scene, seed=seed)
+    made.add("plus", scene="horns")
+    assert fewer_replicates(compare(made.read().cells, METRICS)) == []
+    made.add("plus", state="failed")
+    made.add("plus", seed=1)
+    made.add("lean", values={"lpips": None})
+    made.add("lean", seed=1)
+    (warning,) = fewer_replicates(compare(made.read().cells, METRICS))
+    assert "are lacking: plus on fern (1 of 2), LPIPS of lean on fern (1 of 2). Changes" in warning

@@ -1,4 +1,4 @@
-"""Warns of cells in one table that were trained with other settings or other code.
+"""Warns of cells in one table that differ in settings, in code, or in their replicates.
 
 A sweep gives all cells of a label the same settings, and all cells the same code. Sweeps that are
 joined may differ in both without a contradiction: in scenes or seeds that they don't share, or
@@ -29,6 +29,7 @@ _MAX_KEYS = 8
 #: Beginnings of overrides that every cell of a sweep has.
 _GIVEN = ("preset=", "sweeps=", "train.", "splat.")
 _PARTS = ("train", "splat", "components")
+_REPLICATE = ["variant_seed", "seed"]
 
 
 def other_settings(sweep: Sweep, comparison: Comparison) -> list[str]:
@@ -81,6 +82,36 @@ def other_code(sweep: Sweep) -> list[str]:
     text = (
         "The cells were trained by different code, and a change may be the code's. The first cells"
         f" of each version: {parts}."
+    )
+    return [for_line(text, _MAX_SENTENCE)]
+
+
+def fewer_replicates(comparison: Comparison) -> list[str]:
+    """Return a warning if the labels of a table of values have different replicates.
+
+    Changes are of pairs. Values and scores by method are means over the cells that are done.
+    """
+    cells = comparison.cells[comparison.cells["state"] == "done"]
+    lacking = []
+    for (_, scene), rows in cells.groupby(["condition", "scene"], sort=False):
+        own = rows.drop_duplicates(["label", *_REPLICATE])
+        total, counts = len(own[_REPLICATE].drop_duplicates()), own.value_counts("label")
+        fewer = [(label, counts[label]) for label in own["label"].unique()]
+        lacking += [f"{label} on {scene} ({n} of {total})" for label, n in fewer if n < total]
+        for metric in comparison.metrics:
+            if metric.score is None or metric.optional:
+                continue
+            known = own.groupby("label", sort=False)[metric.name].agg(["count", "size"])
+            partly = known[(known["count"] > 0) & (known["count"] < known["size"])]
+            lacking += [
+                f"{metric.label} of {label} on {scene} ({row['count']} of {row['size']})"
+                for label, row in partly.iterrows()
+            ]
+    if not lacking:
+        return []
+    text = (
+        "Values and scores by method are means over different replicates, and are not to be"
+        f" compared where some are lacking: {listed(lacking)}. Changes are of pairs."
     )
     return [for_line(text, _MAX_SENTENCE)]
 

@@ -28,7 +28,7 @@ from xrgs.report.context import contexts, decided_by_one_view, photographs, with
 from xrgs.report.external import External, with_external
 from xrgs.report.html import write_document
 from xrgs.report.markup import latex_file, to_markdown
-from xrgs.report.mixed import other_code, other_settings
+from xrgs.report.mixed import fewer_replicates, other_code, other_settings
 from xrgs.report.paper import paper_tables, texture_tables, why_no_table, with_texture
 from xrgs.report.pictures import Picture, draw
 from xrgs.report.tables import Tables
@@ -297,6 +297,7 @@ def _warnings(sweep: Sweep, comparison: Comparison) -> list[str]:
             f"The cells were trained with different arithmetic ({', '.join(arithmetics)}): that"
             " makes cells differ as much as another seed does."
         )
+    warnings += fewer_replicates(comparison)
     return [*warnings, *other_settings(sweep, comparison), *other_code(sweep)]
 
 
