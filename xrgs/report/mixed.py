@@ -1,8 +1,8 @@
 """Warns of cells in one table that differ in settings, in code, or in their replicates.
 
-A sweep gives all cells of a label the same settings, and all cells the same code. Sweeps that are
-joined may differ in both without a contradiction: in scenes or seeds that they don't share, or
-where one has no baseline.
+A sweep gives all cells of a label the same code, and the same settings but for those that the file
+of a scene sets. Sweeps that are joined may differ in both without a contradiction: in scenes or
+seeds that they don't share, or where one has no baseline.
 """
 
 from __future__ import annotations
