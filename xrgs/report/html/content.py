@@ -160,7 +160,7 @@ def summary(comparison: Comparison) -> list[tuple[str, list[tuple[str, str]]]]:
     done = comparison.cells[comparison.cells["state"] == "done"]
     named = {metric.name: metric for metric in METRICS}
     metrics = [named[name] for name in _SUMMARY]
-    several = done["condition"].nunique() > 1
+    several = len(set(done["condition"])) > 1
     return [
         (
             shown(titled(scene, condition) if several else scene),
