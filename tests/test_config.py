@@ -241,6 +241,13 @@ def test_a_value_that_cannot_be_names_its_key(overrides: str, message: str) -> N
         composed(overrides)
 
 
+def test_a_number_of_views_that_the_scene_does_not_read_is_refused() -> None:
+    folder = ("scene=folder", "scene.path=p")
+    assert composed(*folder, "scene.views=24").scene.views == 24  # the baseline's value
+    with pytest.raises(XrgsError, match=r"^scene.views=60: .*all photographs of the folder are"):
+        composed(*folder, "scene.views=60")
+
+
 @pytest.mark.slow
 def test_a_value_that_no_component_takes_is_refused_before_training(compose: Compose) -> None:
     for group in asdict(compose().components):

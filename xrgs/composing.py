@@ -116,6 +116,7 @@ def to_conf(cfg: DictConfig) -> Conf:
             setattr(group, name, str(user_path(path)))
     _check_limits(conf)
     _check_strategy(conf)
+    _check_views(conf)
     return conf
 
 
@@ -165,6 +166,23 @@ def _check_strategy(conf: Conf) -> None:
                     f"{key}={value}: must be {accepted} with splat.strategy=mcmc, which splits"
                     " nothing and reads no image-plane gradient"
                 )
+
+
+#: Kinds of scenes whose views are all there are, and what to do for fewer.
+_ALL_VIEWS = {
+    "folder": "all photographs of the folder are taken; for fewer, name another folder",
+    "motorcycle": "the scene has two views",
+}
+
+
+def _check_views(conf: Conf) -> None:
+    """Raise `XrgsError` for a number of views that the kind of scene ignores."""
+    kind, views = conf.scene.kind, conf.scene.views
+    if kind in _ALL_VIEWS and views != _baseline()["scene"]["views"]:
+        raise XrgsError(
+            f"scene.views={views}: is for videos and the embedded scene, and not read with"
+            f" scene.kind={kind}: {_ALL_VIEWS[kind]}"
+        )
 
 
 #: Former group of `components`, now a plugin of the same name -> the key that switched it on, and

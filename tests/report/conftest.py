@@ -95,6 +95,8 @@ class MadeStore:
         seed: int = 0,
         draw: int = 0,
         validation: float | None = None,
+        train: dict[str, Any] | None = None,
+        code: dict[str, str] | None = None,
         factors: dict[str, float] | None = None,
         values: dict[str, Any] | None = None,
         variant: str | None = None,
@@ -110,15 +112,18 @@ class MadeStore:
         """One cell: the made-up baseline's values times `factors`, or `values` outright.
 
         `provenance` and `summary` have more entries of its files, `quality` the scores during
-        training, `scored_by` digests of other scoring code.
+        training, `scored_by` digests of other scoring code. `train` and `code` are those of its
+        identity.
         """
         cell_id = f"cell{len(self.rows):05d}"
         variant = variant or f"variant-of-{len(scene)}-{scene[:3]}".replace("/", "_")
         found = SUMMARY | SCORES | (values or {})
         found |= {key: found[key] * factor for key, factor in (factors or {}).items()}
         folder = self.store.cell(cell_id)
-        train = {} if validation is None else {"validation": validation}
-        identity = Identity(variant=variant, seed=seed, train=train, splat={}, components={})
+        train = (train or {}) | ({} if validation is None else {"validation": validation})
+        identity = Identity(
+            variant=variant, seed=seed, train=train, splat={}, components={}, code=code or {}
+        )
         folder.path.mkdir()
         write_json(folder.path / "identity.json", msgspec.to_builtins(identity))
         begin_attempt(folder)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import tarfile
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from tests.conftest import composed
@@ -93,6 +94,18 @@ def test_full_paths_become_relative(store: Store, tmp_path: Path) -> None:
     assert other.cell("c1").config().store == "my store"
     command = other.sweep_record().command
     assert command == ("+ablation=x,y", "scene.path=data/fern,horns", "threads=1")
+
+
+def test_paths_in_quotes_and_in_errors_become_relative(store: Store, tmp_path: Path) -> None:
+    paths = f"'{tmp_path}/my fern','/elsewhere/my horns/**'"
+    failed = msgspec.structs.replace(row("c2"), error=f"scene.path={tmp_path}/my fern: few views")
+    rows = [row("c1"), failed]
+    sweep_id = store.write_sweep(["+ablation=[x,y]", f"scene.path={paths}", "x.y=1/2"], rows)
+    pack_all(store, tmp_path / "a.tar.xz")
+    other = unpacked(tmp_path / "a.tar.xz", tmp_path / "other")
+    record = unchanged_record(other.sweeps / f"{sweep_id}.json")
+    assert record.command[1:] == ("scene.path='my fern','my horns/**'", "x.y=1/2")
+    assert record.cells[1].error == "scene.path=my fern: few views"
 
 
 def test_the_records_are_those_of_the_sweeps_that_are_named(store: Store, tmp_path: Path) -> None:

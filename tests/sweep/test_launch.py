@@ -282,7 +282,8 @@ def odd(tmp_path: Path) -> Path:
 def test_a_job_finds_its_folders_wherever_it_runs(
     compose: Callable[..., config.Conf], odd: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    conf = compose("scene=folder", "scene.path=p", "store=s", "seed=1", "splat.backend=auto")
+    folders = ("scene.path=p", "scene.masks=m", "variant.poses=q", "store=s")
+    conf = compose("scene=folder", *folders, "seed=1", "splat.backend=auto")
     cell, store = planned(conf, "a"), Store("s")
     monkeypatch.chdir(odd)
     store.prepare()
@@ -292,6 +293,8 @@ def test_a_job_finds_its_folders_wherever_it_runs(
     given = Store(odd / "s").cell(str(cell.cell_id))
     conf_given = given.config()
     assert (conf_given.store, conf_given.scene.path) == (str(odd / "s"), str(odd / "p"))
+    given_photographs = (conf_given.scene.masks, conf_given.variant.poses)
+    assert given_photographs == (str(odd / "m"), str(odd / "q"))
     assert (conf_given.seed, conf_given.threads) == (1, 3)
     assert conf_given.splat.backend in {"native", "torch"}
     assert cell_id(given.identity()) == cell.cell_id == cell_id(cell_identity(conf_given, "v"))

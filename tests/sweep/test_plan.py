@@ -183,11 +183,30 @@ def test_a_label_whose_cells_have_the_config_of_the_baseline_is_named(
     assert unchanged([base, same, other]) == [
         "idle changes nothing here: its cells are those of baseline"
     ]
+    # A key of a component that is off is in no cell's id.
+    components = base.conf.components
+    consistency = replace(components.consistency, l1=0.5)
+    off = replace(base.conf, components=replace(components, consistency=consistency))
+    idle = replace(base, spec=CellSpec("l1=0.5", "", (), ("z=1",)), conf=off)
+    assert unchanged([base, idle]) == [
+        "l1=0.5 changes nothing here: its cells are those of baseline"
+    ]
     # What a cell that waits will be is the baseline with a count, which is not known yet.
     spec = CellSpec("count_matched to plus", "", (), ("+ablation=count_matched",))
     control = replace(base, spec=spec, conf=replace(base.conf, matched_to="plus"))
     assert control.waits
     assert unchanged([base, control]) == []
+
+
+def test_a_condition_with_the_cells_of_another_is_named(cell: Callable[..., PlannedCell]) -> None:
+    """As of `variant.jpeg_quality=10,50` without `variant.degradation=jpeg`."""
+    plan = [
+        replace(cell(name), spec=CellSpec(BASELINE, condition, (condition,), ()))
+        for name, condition in (("a", "q=1"), ("a", "q=2"), ("b", "q=3"))
+    ]
+    line = "q=2 changes nothing here: its cells are those of q=1"
+    assert unchanged(plan) == [line]
+    assert unchanged([replace(one, cell_id=None) for one in plan]) == []  # not known yet
 
 
 @pytest.mark.parametrize(

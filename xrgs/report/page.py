@@ -28,6 +28,7 @@ from xrgs.report.context import contexts, decided_by_one_view, photographs, with
 from xrgs.report.external import External, with_external
 from xrgs.report.html import write_document
 from xrgs.report.markup import latex_file, to_markdown
+from xrgs.report.mixed import fewer_replicates, other_code, other_settings
 from xrgs.report.paper import paper_tables, texture_tables, why_no_table, with_texture
 from xrgs.report.pictures import Picture, draw
 from xrgs.report.tables import Tables
@@ -125,8 +126,8 @@ class _Page:
     def __init__(self, sweep: Sweep, tables: Tables) -> None:
         self._sweep = sweep
         self._tables = tables
-        self._warnings = _warnings(sweep)
         comparison = tables.comparison
+        self._warnings = _warnings(sweep, comparison)
         self._conditions = list(dict.fromkeys(comparison.cells["condition"]))
         paper = paper_tables(comparison, tables.contexts)
         #: The tables of all ablations: changes, the paper's numbers, shares of the gap.
@@ -255,7 +256,7 @@ def _csv(table: pd.DataFrame) -> str:
     return str(safe.to_csv(index=False, lineterminator="\n"))
 
 
-def _warnings(sweep: Sweep) -> list[str]:
+def _warnings(sweep: Sweep, comparison: Comparison) -> list[str]:
     warnings = []
     states = sweep.cells["state"]
     if pending := int((states == "pending").sum()):
@@ -296,7 +297,8 @@ def _warnings(sweep: Sweep) -> list[str]:
             f"The cells were trained with different arithmetic ({', '.join(arithmetics)}): that"
             " makes cells differ as much as another seed does."
         )
-    return warnings
+    warnings += fewer_replicates(comparison)
+    return [*warnings, *other_settings(sweep, comparison), *other_code(sweep)]
 
 
 def _stale_warning(sweep: Sweep) -> list[str]:

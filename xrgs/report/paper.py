@@ -158,7 +158,7 @@ def _beside(
         align="llrrrrrl",
         notes=(
             "confirmed: the 95 % interval is on the paper's side of 0; refuted: it is on the other"
-            " side; open: it holds 0, or there is none",
+            " side; open: it holds 0, is of fewer than three values, or there is none",
             *(
                 f"{metric.label} is not comparable: {_NOT_COMPARABLE[metric.name]}"
                 for metric in metrics

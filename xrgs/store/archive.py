@@ -27,17 +27,19 @@ import msgspec
 from xrgs.errors import StoreError, XrgsError
 from xrgs.mixture import paths, saved_variant, variant
 from xrgs.photos import scenes
+from xrgs.photos.scenes.scene import ALL_BELOW
 from xrgs.runtime import lease
 from xrgs.runtime.progress import progress
 from xrgs.runtime.text import listed
 from xrgs.safeio.atomic import atomic_writer, json_text
 from xrgs.safeio.files import is_inside, is_name, remove_path, sync_name, sync_tree, walk_files
+from xrgs.safeio.hashing import digest
 from xrgs.safeio.records import errors_named, read_file, read_struct, read_table
 from xrgs.safeio.sanitize import counted, for_line
 from xrgs.store import trimming
 from xrgs.store.cell_folder import CONFIG, NOT_RESULTS, STATUS, CellFolder, CellState
 from xrgs.store.identity import cell_id
-from xrgs.store.schema import FileEntry
+from xrgs.store.schema import FileEntry, RecordedCell
 from xrgs.store.store import Store, unchanged_record
 
 #: The folder in the archive; the default of `store=`, so that commands find it once it is unpacked.
@@ -151,7 +153,19 @@ def _record(store: Store, sweep_id: str, here: Path) -> _Files:
     file = store.sweeps / f"{sweep_id}.json"
     record = unchanged_record(file)
     command = tuple(_relative_argument(word, here) for word in record.command)
-    text = json_text(msgspec.to_builtins(msgspec.structs.replace(record, command=command)))
+    full = [path for word in record.command for path in _FULL_PATH.findall(word)]
+
+    def shown(row: RecordedCell) -> RecordedCell:
+        error = row.error
+        for path in sorted(full, key=len, reverse=True) * bool(error):
+            error = error and error.replace(path, _relative(path, here))
+        return msgspec.structs.replace(row, error=error and error.replace(f"{here}/", ""))
+
+    cells = tuple(map(shown, record.cells))
+    record = msgspec.structs.replace(
+        record, command=command, cells=cells, digest=digest(msgspec.to_builtins(cells))
+    )
+    text = json_text(msgspec.to_builtins(record))
     return {f"sweeps/{file.name}": (text.encode(), file.stat().st_mtime)}
 
 
@@ -164,13 +178,19 @@ def _relative(value: Any, here: Path) -> Any:
     if not (isinstance(value, str) and PurePath(value).is_absolute()):
         return value
     path = PurePath(value)
-    return str(path.relative_to(here)) if path.is_relative_to(here) else path.name
+    if path.is_relative_to(here):
+        return str(path.relative_to(here))
+    below = ALL_BELOW.strip("/")  # of `/a/garden/**` the name is garden
+    return f"{path.parent.name}/{below}" if path.name == below else path.name
+
+
+#: A full path in an argument: behind a sign of Hydra's grammar, up to the next one.
+_FULL_PATH = re.compile(r"""(?<![^=,\[('" ])/[^,\[\]()'"]*""")
 
 
 def _relative_argument(word: str, here: Path) -> str:
-    """Make the values of an argument relative: `scene.path=/a/fern,/a/horns`."""
-    key, equals, values = word.rpartition("=")
-    return key + equals + ",".join(_relative(value, here) for value in values.split(","))
+    """Make the paths of an argument relative: `scene.path=/a/fern,'/a/my horns'`."""
+    return _FULL_PATH.sub(lambda found: _relative(found[0], here), word)
 
 
 # Importing

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 from xrgs import plugins
-from xrgs.config import Conf
+from xrgs.config import Conf, identity_values
 from xrgs.errors import XrgsError
 from xrgs.mixture.paths import TO_TRY
 from xrgs.mixture.split import check_variant_conf
@@ -307,22 +308,42 @@ def expected_use(plan: Sequence[PlannedCell], past: int) -> str:
 
 
 def unchanged(plan: Sequence[PlannedCell]) -> list[str]:
-    """Return a line for each label whose cells have the config of their baselines."""
-    bases = {cell.spec.shared: cell.conf for cell in plan if cell.spec.label == BASELINE}
+    """Return a line for each label, and each condition, whose cells are those of another one.
+
+    A label is compared with the baseline, and a condition with those before it.
+    """
+    bases = {cell.spec.shared: cell for cell in plan if cell.spec.label == BASELINE}
     differs: dict[str, bool] = {}
     for cell in plan:
         if cell.spec.label != BASELINE and (base := bases.get(cell.spec.shared)) is not None:
             # The config of a cell that waits for a count is not complete.
-            same = not cell.waits and all(
-                getattr(cell.conf, name) == getattr(base, name)
-                for name in ("splat", "train", "components", "variant", "scene", "seed")
-            )
+            same = not cell.waits and _means(cell) == _means(base)
             differs[cell.spec.label] = differs.get(cell.spec.label, False) or not same
-    return [
+    lines = [
         f"{label} changes nothing here: its cells are those of {BASELINE}"
         for label, any_differs in differs.items()
         if not any_differs
     ]
+    by_condition: dict[str, dict[tuple[str, str, int, int], str | None]] = {}
+    for cell in plan:
+        conf = cell.conf
+        run = cell.spec.label, scenes.label(conf.scene), conf.variant.seed, conf.seed
+        by_condition.setdefault(cell.spec.condition, {})[run] = cell.cell_id
+    first: dict[frozenset[Any], str] = {}  # the cells of a condition -> the condition
+    for condition, cells in by_condition.items():
+        if None in cells.values():  # until its variant is built, a cell is not known
+            continue
+        before = first.setdefault(frozenset(cells.items()), condition)
+        if before != condition:
+            lines.append(f"{condition} changes nothing here: its cells are those of {before}")
+    return lines
+
+
+def _means(cell: PlannedCell) -> tuple[Any, ...]:
+    """Return what decides a cell's numbers, also while its variant is not built."""
+    conf = cell.conf
+    settings = [identity_values(group) for group in (conf.splat, conf.train, conf.components)]
+    return (*settings, conf.variant, conf.scene, conf.seed)
 
 
 def will_fail(plan: Sequence[PlannedCell]) -> bool:

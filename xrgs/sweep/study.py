@@ -487,9 +487,10 @@ def _hand_over(cell: PlannedCell, threads: int, store: Store) -> list[str]:
     """Write a cell's config for a job on any machine; return the overrides of the job."""
     if cell.identity is None or cell.cell_id is None:
         raise ValueError(f"{cell.name}: launched without an identity")
-    home, scene = store.path.absolute(), cell.conf.scene
-    path, masks = (
-        str(user_path(text).absolute()) if text else text for text in (scene.path, scene.masks)
+    home, scene, variant = store.path.absolute(), cell.conf.scene, cell.conf.variant
+    path, masks, poses = (
+        str(user_path(text).absolute()) if text else text
+        for text in (scene.path, scene.masks, variant.poses)
     )
     conf = replace(
         cell.conf,
@@ -497,6 +498,7 @@ def _hand_over(cell: PlannedCell, threads: int, store: Store) -> list[str]:
         splat=replace(cell.conf.splat, backend=resolve_backend(cell.conf.splat.backend)),
         threads=cell.conf.threads or threads,
         scene=replace(scene, path=path, masks=masks),
+        variant=replace(variant, poses=poses),
     )
     # Under the lease: since the plan, another sweep may have begun or finished the cell.
     cell_lease = lease.acquire(store.leases, cell.cell_id)

@@ -17,10 +17,13 @@ from PIL import Image
 
 from tests.report.conftest import MadeStore, configured
 from tests.report.html.conftest import HOSTILE, HR, data_of, make_gaussians, page_of
+from xrgs.evaluation.metrics import METRICS
 from xrgs.formats.ply import save_ply
 from xrgs.photos import images
 from xrgs.report import build
+from xrgs.report.compare import compare
 from xrgs.report.html import document
+from xrgs.report.html.content import summary
 from xrgs.report.html.images import Album, error_map
 from xrgs.store.store import Store
 
@@ -232,3 +235,13 @@ def test_without_pictures_there_are_tables_and_the_arms_that_differ(
     assert "<td>1 HR (48 × 36 px); 2 LR (24 × 18 px); 2 test (48 × 36 px)</td>" in text
     caution = '<p class="warning">Caution: fern has 2 scored views: its scores say little of other'
     assert caution in text
+
+
+def test_the_summary_of_one_label_keeps_conditions_apart(tmp_path: Path) -> None:
+    made = MadeStore(tmp_path / "store")
+    for value, psnr in ((2, 20.0), (5, 10.0)):
+        made.add(condition=f"variant.factor={value}", values={"psnr": psnr})
+    found = {
+        name: dict(rows)["PSNR"] for name, rows in summary(compare(made.read().cells, METRICS))
+    }
+    assert found == {"fern (variant.factor=2)": "20.00 dB", "fern (variant.factor=5)": "10.00 dB"}

@@ -153,16 +153,20 @@ _SUMMARY = ("psnr", "ssim", "lpips", "gaussians", "training_time_s")
 
 
 def summary(comparison: Comparison) -> list[tuple[str, list[tuple[str, str]]]]:
-    """Return (scene, [(metric, value)]) for the metrics of `_SUMMARY`: means over done cells."""
+    """Return (scene, [(metric, value)]) for the metrics of `_SUMMARY`: means over done cells.
+
+    Several conditions have an entry each, with the condition beside the scene's name.
+    """
     done = comparison.cells[comparison.cells["state"] == "done"]
     named = {metric.name: metric for metric in METRICS}
     metrics = [named[name] for name in _SUMMARY]
+    several = len(set(done["condition"])) > 1
     return [
         (
-            shown(scene),
+            shown(titled(scene, condition) if several else scene),
             [(m.label, number(v, m.unit)) for m in metrics if (v := rows[m.name].mean()) == v],
         )
-        for scene, rows in done.groupby("scene")
+        for (scene, condition), rows in done.groupby(["scene", "condition"])
     ]
 
 
