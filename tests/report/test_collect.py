@@ -86,6 +86,18 @@ def test_two_different_cells_in_one_place_are_refused(
         build(b, [first, other], pictures=[])
 
 
+def test_rows_that_contradict_each_other_can_be_left_out(two: tuple[Path, str, str]) -> None:
+    b, first, second = two
+    store = Store(b)
+    found = store.sweep_record(second).cells
+    rows = [*found, *(msgspec.structs.replace(row, scene="fern") for row in found)]
+    both = [first, store.write_sweep([], rows)]
+    report = build(b, both, pictures=[], choice=Choice(scenes=("room",)))
+    assert set(table(report.folder)) == {"plus mean", "plus scene room"}
+    with pytest.raises(ReportError, match="fern / baseline / seed 0 is cell"):
+        build(b, both, pictures=[], choice=Choice(scenes=("fern",)))
+
+
 def test_a_sweep_that_runs_is_reported_with_what_is_done(made: Any) -> None:
     for seed in range(2):
         made.add(seed=seed)

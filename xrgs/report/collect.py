@@ -328,21 +328,25 @@ class Choice:
     ablations: tuple[str, ...] = ()
     """Labels of ablations and controls, beside their base; empty for all."""
 
-    def rows(self, rows: Sequence[RecordedCell], against: str) -> list[RecordedCell]:
-        """Return the chosen rows of a record; those of `against` and the baseline stay.
+    def rows(self, rows: Sequence[tuple[str, RecordedCell]], against: str) -> list[RecordedCell]:
+        """Return the chosen rows of `sweep_records`, each run once; `against` and baselines stay.
 
         Raises:
             ReportError: No row has a chosen scene or label; the message lists the existing ones.
+                Or two records have different cells for one run; the message names both.
         """
-        _check_known("scenes", self.scenes, [row.scene for row in rows])
-        _check_known("ablations", self.ablations, [row.label for row in rows])
+        _check_known("scenes", self.scenes, [row.scene for _, row in rows])
+        _check_known("ablations", self.ablations, [row.label for _, row in rows])
         labels = {*self.ablations, against, BASELINE}
-        return [
-            row
-            for row in rows
-            if (not self.scenes or row.scene in self.scenes)
-            and (not self.ablations or row.label in labels)
-        ]
+        chosen: dict[tuple[object, ...], tuple[str, RecordedCell]] = {}
+        for sweep_id, row in rows:
+            if self.scenes and row.scene not in self.scenes:
+                continue
+            if self.ablations and row.label not in labels:
+                continue
+            key = (row.scene, row.condition, row.label, row.variant_seed, row.seed)
+            chosen[key] = sweep_id, _fuller(chosen.get(key), sweep_id, row)
+        return [row for _, row in chosen.values()]
 
     @property
     def suffix(self) -> str:
@@ -382,22 +386,15 @@ class ReportStore(Store):
 
     def sweep_records(
         self, sweep_ids: Sequence[str]
-    ) -> tuple[dict[str, tuple[str, ...]], list[RecordedCell]]:
-        """Return the command of each sweep, by its id, and the rows of all records, each run once.
+    ) -> tuple[dict[str, tuple[str, ...]], list[tuple[str, RecordedCell]]]:
+        """Return the command of each sweep, by its id, and the rows of all records with the id.
 
         Raises:
             StoreError: There is no such sweep, or its record is damaged.
-            ReportError: Two records have different cells for one run; the message names both.
         """
-        commands: dict[str, tuple[str, ...]] = {}
-        rows: dict[tuple[object, ...], tuple[str, RecordedCell]] = {}
-        for sweep_id in sweep_ids:
-            record = self.sweep_record(sweep_id)
-            commands[sweep_id] = record.command
-            for row in record.cells:
-                key = (row.scene, row.condition, row.label, row.variant_seed, row.seed)
-                rows[key] = sweep_id, _fuller(rows.get(key), sweep_id, row)
-        return commands, [row for _, row in rows.values()]
+        records = {sweep_id: self.sweep_record(sweep_id) for sweep_id in sweep_ids}
+        commands = {sweep_id: record.command for sweep_id, record in records.items()}
+        return commands, [(name, row) for name, record in records.items() for row in record.cells]
 
 
 def _fuller(old: tuple[str, RecordedCell] | None, sweep_id: str, row: RecordedCell) -> RecordedCell:

@@ -94,7 +94,7 @@ def build(
     named = (sweep_ids,) if isinstance(sweep_ids, str) else sweep_ids
     ids = tuple(dict.fromkeys(named or (store.latest_sweep(),)))
     commands, rows = store.sweep_records(ids)
-    labels = [row.label for row in rows]
+    labels = [row.label for _, row in rows]
     base = labels[0] if against == BASELINE and BASELINE not in labels else against
     sweep = read_cells(store, commands, choice.rows(rows, base))
     sweep = with_variants(sweep, store)
