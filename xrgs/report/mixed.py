@@ -8,7 +8,6 @@ seeds that they don't share, or where one has no baseline.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import reduce
 from typing import Any
 
 import pandas as pd
@@ -42,7 +41,8 @@ def other_settings(sweep: Sweep, comparison: Comparison) -> list[str]:
     settings = {cell_id: _settings(sweep.done[cell_id]) for cell_id in cells["cell_id"].unique()}
     several_commands = len({_given(command) for command in sweep.commands.values()}) > 1
     warnings = []
-    for (label, condition), rows in cells.groupby(["label", "condition"], sort=False):
+    groups: Any = cells.groupby(["label", "condition"], sort=False)
+    for (label, condition), rows in groups:
         name = ", ".join(filter(None, (label, condition)))
         if keys := _differing([settings[cell_id] for cell_id in rows["cell_id"]]):
             values = "; ".join(_by_scene(key, sweep, rows) for key in keys[:_MAX_KEYS])
@@ -151,6 +151,8 @@ def _by_scene(key: str, sweep: Sweep, rows: pd.DataFrame) -> str:
 def _value(cell: DoneCell, key: str) -> str:
     """Return the value of a key that some cells have in their identity."""
     value = _settings(cell).get(key)
-    if value is None and cell.config is not None:
-        value = reduce(lambda group, name: getattr(group, name, None), key.split("."), cell.config)
+    if value is None:
+        value = cell.config
+        for name in key.split("."):
+            value = getattr(value, name, None)
     return "off" if value is None else f"{value:g}" if isinstance(value, float) else str(value)

@@ -161,12 +161,13 @@ def summary(comparison: Comparison) -> list[tuple[str, list[tuple[str, str]]]]:
     named = {metric.name: metric for metric in METRICS}
     metrics = [named[name] for name in _SUMMARY]
     several = len(set(done["condition"])) > 1
+    groups: Any = done.groupby(["scene", "condition"])
     return [
         (
             shown(titled(scene, condition) if several else scene),
             [(m.label, number(v, m.unit)) for m in metrics if (v := rows[m.name].mean()) == v],
         )
-        for (scene, condition), rows in done.groupby(["scene", "condition"])
+        for (scene, condition), rows in groups
     ]
 
 
