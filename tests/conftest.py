@@ -36,7 +36,6 @@ from hypothesis import HealthCheck, settings
 
 from tests import pdflatex
 from xrgs import composing, config
-from xrgs.cli import sweep as sweep_command
 from xrgs.errors import XrgsError
 from xrgs.evaluation.lpips import weights
 from xrgs.mixture import variant
@@ -388,12 +387,8 @@ def swept(made_once: Callable[..., Path], smoke_variants: Path) -> tuple[Path, s
             redirect_stdout(io.StringIO()) as out,
             redirect_stderr(io.StringIO()) as err,
         ):
-            patch.chdir(folder)
-            patch.setenv("OMP_WAIT_POLICY", os.environ.get("OMP_WAIT_POLICY", "passive"))
-            patch.setattr(sweep_command, "exit_on_signal", nullcontext)
             patch.setattr(job, "run_in_child", work_here)
-            patch.setattr(sys, "argv", ["xrgs-sweep", *SWEEP])
-            sweep_command.main()
+            _prepared(patch, folder, "sweep", *SWEEP)()
         assert err.getvalue().count("training cell") == 2
         (folder / "printed").write_text(out.getvalue(), encoding="utf-8")
 
@@ -589,6 +584,19 @@ def server(pauses: list[float]) -> Iterator[Server]:
         thread.join()
 
 
+def _prepared(
+    patch: pytest.MonkeyPatch, folder: Path, name: str, *arguments: str
+) -> Callable[[], object]:
+    """Return the `main` of a command, for which this process is prepared until the patch ends."""
+    main: Callable[[], object] = importlib.import_module(f"xrgs.cli.{name}").main
+    for module in (name, "sweep"):  # pytest keeps its own handlers of signals
+        patch.setattr(f"xrgs.cli.{module}.exit_on_signal", nullcontext, raising=False)
+    patch.chdir(folder)
+    patch.setenv("OMP_WAIT_POLICY", os.environ.get("OMP_WAIT_POLICY", "passive"))
+    patch.setattr(sys, "argv", [f"xrgs-{name}", *arguments])
+    return main
+
+
 @pytest.fixture
 def call_command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -600,12 +608,7 @@ def call_command(
     """
 
     def call(name: str, *arguments: str) -> tuple[int, str, str]:
-        main = importlib.import_module(f"xrgs.cli.{name}").main
-        for module in (name, "sweep"):  # pytest keeps its own handlers of signals
-            monkeypatch.setattr(f"xrgs.cli.{module}.exit_on_signal", nullcontext, raising=False)
-        monkeypatch.chdir(tmp_path)
-        monkeypatch.setenv("OMP_WAIT_POLICY", os.environ.get("OMP_WAIT_POLICY", "passive"))
-        monkeypatch.setattr(sys, "argv", [f"xrgs-{name}", *arguments])
+        main = _prepared(monkeypatch, tmp_path, name, *arguments)
         code, message = 0, ""
         try:
             main()

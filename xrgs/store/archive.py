@@ -153,13 +153,15 @@ def _record(store: Store, sweep_id: str, here: Path) -> _Files:
     file = store.sweeps / f"{sweep_id}.json"
     record = unchanged_record(file)
     command = tuple(_relative_argument(word, here) for word in record.command)
-    full = [path for word in record.command for path in _FULL_PATH.findall(word)]
+    found = [path for word in record.command for path in _FULL_PATH.findall(word)]
+    full = sorted(found, key=len, reverse=True)  # a path may begin with another one
 
     def shown(row: RecordedCell) -> RecordedCell:
-        error = row.error
-        for path in sorted(full, key=len, reverse=True) * bool(error):
-            error = error and error.replace(path, _relative(path, here))
-        return msgspec.structs.replace(row, error=error and error.replace(f"{here}/", ""))
+        if (error := row.error) is None:
+            return row
+        for path in full:
+            error = error.replace(path, _relative(path, here))
+        return msgspec.structs.replace(row, error=error.replace(f"{here}/", ""))
 
     cells = tuple(map(shown, record.cells))
     record = msgspec.structs.replace(

@@ -317,7 +317,7 @@ def unchanged(plan: Sequence[PlannedCell]) -> list[str]:
     for cell in plan:
         if cell.spec.label != BASELINE and (base := bases.get(cell.spec.shared)) is not None:
             # The config of a cell that waits for a count is not complete.
-            same = not cell.waits and _means(cell) == _means(base)
+            same = not cell.waits and _deciding_values(cell) == _deciding_values(base)
             differs[cell.spec.label] = differs.get(cell.spec.label, False) or not same
     lines = [
         f"{label} changes nothing here: its cells are those of {BASELINE}"
@@ -339,7 +339,7 @@ def unchanged(plan: Sequence[PlannedCell]) -> list[str]:
     return lines
 
 
-def _means(cell: PlannedCell) -> tuple[Any, ...]:
+def _deciding_values(cell: PlannedCell) -> tuple[Any, ...]:
     """Return what decides a cell's numbers, also while its variant is not built."""
     conf = cell.conf
     settings = [identity_values(group) for group in (conf.splat, conf.train, conf.components)]
