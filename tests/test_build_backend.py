@@ -257,6 +257,7 @@ def test_a_build_carries_the_commit_and_leaves_no_file(
     assert not file.exists()
 
 
+@pytest.mark.slow
 def test_a_wheel_of_an_sdist_has_the_commit_of_the_sdist(
     backend: Any, scikit_build: ScikitBuild, checkout: Path
 ) -> None:
@@ -271,6 +272,7 @@ def test_a_wheel_of_an_sdist_has_the_commit_of_the_sdist(
     assert built == [file.read_text()] == ['{"git": "0123", "git_diff_sha256": null}']
 
 
+@pytest.mark.slow
 def test_a_checkout_that_cannot_be_written_is_built_without_its_commit(
     backend: Any, scikit_build: ScikitBuild, checkout: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -282,6 +284,7 @@ def test_a_checkout_that_cannot_be_written_is_built_without_its_commit(
     assert "the package will not know its commit" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_build_that_raises_leaves_the_environment_and_no_commit_file(
     backend: Any, scikit_build: ScikitBuild, checkout: Path
 ) -> None:

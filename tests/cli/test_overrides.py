@@ -349,6 +349,7 @@ def test_numbers_in_a_notation_of_people_are_answered_with_the_words_to_type(
         )
 
 
+@pytest.mark.slow
 def test_words_that_a_later_one_replaces_are_said(sweep_here: RunCommand) -> None:
     """As bash makes them of `seed={0..2}`; a word that is only repeated is no mistake."""
     said = "seed is given 3 times, and seed=2 replaces the others; for all of them write seed=0,1,2"

@@ -126,6 +126,7 @@ def test_the_command_that_minutes_prints_makes_the_same_cell(
     assert handed_over(Mixture(3, 8), *again[1:]) == chosen
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("garden")
 def test_the_user_may_replace_what_minutes_choose(
     handed_over: Callable[..., dict[str, str]],

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import os
 import struct
+import sys
 import threading
 from collections import defaultdict
 from collections.abc import Callable, Iterator
@@ -74,7 +75,11 @@ class Swept:
 
 @pytest.fixture
 def swept(cells: Any, monkeypatch: pytest.MonkeyPatch) -> Swept:
-    """An empty store, and no tracker's server in the environment."""
+    """An empty store, no tracker's server in the environment, and no launcher of W&B's.
+
+    Its import takes longer than all else here, in each process that begins a run.
+    """
+    monkeypatch.setitem(sys.modules, "wandb.sdk.launch.inputs.internal", None)  # it logs that
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
     monkeypatch.setenv("WANDB_MODE", "offline")
     return Swept(cells)
