@@ -223,8 +223,6 @@ def composed_by_hydra(*overrides: str) -> config.Conf:
 #: An override with a number, a flag, a name or a path, and keys from which `conf/` takes others.
 _PLAIN = re.compile(r"([a-z]\w*(?:\.\w+)+|threads|checkpoint_s|store)=([-+\w./]+)")
 _TAKEN_FROM = frozenset({"splat.raster.background", "splat.densify.stop"})
-#: Words that make no config without the plain ones.
-_incomplete: set[tuple[str, ...]] = set()
 
 
 def composed(*overrides: str) -> config.Conf:
@@ -233,19 +231,18 @@ def composed(*overrides: str) -> config.Conf:
     tests/test_config.py compares the two. What is not plain, and unknown keys and wrong types, are
     left to Hydra.
     """
-    plain = [word.split("=") for word in overrides if _PLAIN.fullmatch(word)]
+    plain = dict(word.split("=") for word in overrides if _PLAIN.fullmatch(word))
     others = tuple(word for word in overrides if not _PLAIN.fullmatch(word))
-    if "scene.path" in dict(plain):
-        others += ("scene.path=/",)  # a folder makes no config without it
-    if not plain or others in _incomplete or _TAKEN_FROM & {key for key, _ in plain}:
+    if not plain or _TAKEN_FROM & plain.keys():
         return composed_by_hydra(*overrides)
+    if "scene.path" in plain:
+        others += ("scene.path=/",)  # a folder makes no config without it
     try:
         values = asdict(composed_by_hydra(*others))
     except Exception:  # a value is missing
-        _incomplete.add(others)
         return composed_by_hydra(*overrides)
     try:
-        for key, text in plain:
+        for key, text in plain.items():
             *groups, name = key.split(".")
             group = reduce(getitem, groups, values)
             group[name] = _value_like(group[name], text)

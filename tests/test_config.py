@@ -327,7 +327,8 @@ def test_a_plain_value_in_a_composed_config_is_hydras() -> None:
         "splat.optimizer.eps=0.5",
         "store=/a/b",
     )
-    for arm in ((), ("+ablation=mip",), ("scene=motorcycle", "preset=smoke")):
+    folder = ("scene=folder", "scene.path=/a/b")
+    for arm in ((), ("+ablation=mip",), ("scene=motorcycle", "preset=smoke"), folder):
         assert composed(*arm, *words) == composed_by_hydra(*arm, *words)
     with pytest.raises(HydraException, match=r"train\.steps=many"):
         composed("train.steps=many")
