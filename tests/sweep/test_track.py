@@ -75,11 +75,9 @@ class Swept:
 
 @pytest.fixture
 def swept(cells: Any, monkeypatch: pytest.MonkeyPatch) -> Swept:
-    """An empty store, no tracker's server in the environment, and no launcher of W&B's.
-
-    Its import takes longer than all else here, in each process that begins a run.
-    """
-    monkeypatch.setitem(sys.modules, "wandb.sdk.launch.inputs.internal", None)  # it logs that
+    """An empty store, and no tracker's server in the environment."""
+    # W&B goes on without its launcher, whose import takes seconds.
+    monkeypatch.setitem(sys.modules, "wandb.sdk.launch.inputs.internal", None)
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
     monkeypatch.setenv("WANDB_MODE", "offline")
     return Swept(cells)
