@@ -31,8 +31,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 import yaml
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hypothesis import HealthCheck, settings
 
 from tests import pdflatex
 from xrgs import composing, config
@@ -48,21 +46,26 @@ if TYPE_CHECKING:
     from xrgs.splat.cameras import Camera
     from xrgs.training.dataset import Dataset
 
-# How long an example takes tells how busy the machine is, and fails no test.
-settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
-settings.load_profile("untimed")
-
 pytest_plugins = ["tests.variant_fixtures"]
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_collection() -> Generator[None, object, object]:
+def pytest_collection(session: pytest.Session) -> Generator[None, object, object]:
     """Look for no garbage among what is imported: that takes a quarter of the collection's time.
 
     It stays until the end, so that tests needn't look through it either.
     """
+    if session.config.getoption("numprocesses", None):  # its workers collect
+        return (yield)
     gc.disable()
     _hydra_reads_equal_text_once()
+    os.environ["HYPOTHESIS_NO_PLUGINS"] = "1"  # one would import all of trio
+    from hypothesis import HealthCheck, settings
+
+    # How long an example takes tells how busy the machine is, and fails no test.
+    health = [HealthCheck.too_slow]
+    settings.register_profile("untimed", deadline=None, suppress_health_check=health)
+    settings.load_profile("untimed")
     try:
         return (yield)
     finally:
@@ -73,11 +76,13 @@ def pytest_collection() -> Generator[None, object, object]:
 
 def _hydra_reads_equal_text_once() -> None:
     """Keep what Hydra parses of a word and of a file: most of the time of a config goes there."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
     words: dict[tuple[str, str], Any] = {}
     files: dict[tuple[str, str], bytes] = {}
     parse, load = OverridesParser.parse_rule, yaml.load
 
-    def parse_once(parser: OverridesParser, word: str, rule: str) -> Any:
+    def parse_once(parser: Any, word: str, rule: str) -> Any:
         if (word, rule) not in words:
             words[word, rule] = parse(parser, word, rule)
         return deepcopy(words[word, rule])
@@ -218,8 +223,6 @@ def composed_by_hydra(*overrides: str) -> config.Conf:
 #: An override with a number, a flag, a name or a path, and keys from which `conf/` takes others.
 _PLAIN = re.compile(r"([a-z]\w*(?:\.\w+)+|threads|checkpoint_s|store)=([-+\w./]+)")
 _TAKEN_FROM = frozenset({"splat.raster.background", "splat.densify.stop"})
-#: Words that make no config without the plain ones.
-_incomplete: set[tuple[str, ...]] = set()
 
 
 def composed(*overrides: str) -> config.Conf:
@@ -228,17 +231,18 @@ def composed(*overrides: str) -> config.Conf:
     tests/test_config.py compares the two. What is not plain, and unknown keys and wrong types, are
     left to Hydra.
     """
-    plain = [word.split("=") for word in overrides if _PLAIN.fullmatch(word)]
+    plain = dict(word.split("=") for word in overrides if _PLAIN.fullmatch(word))
     others = tuple(word for word in overrides if not _PLAIN.fullmatch(word))
-    if not plain or others in _incomplete or _TAKEN_FROM & {key for key, _ in plain}:
+    if not plain or _TAKEN_FROM & plain.keys():
         return composed_by_hydra(*overrides)
+    if "scene.path" in plain:
+        others += ("scene.path=/",)  # a folder makes no config without it
     try:
         values = asdict(composed_by_hydra(*others))
     except Exception:  # a value is missing
-        _incomplete.add(others)
         return composed_by_hydra(*overrides)
     try:
-        for key, text in plain:
+        for key, text in plain.items():
             *groups, name = key.split(".")
             group = reduce(getitem, groups, values)
             group[name] = _value_like(group[name], text)

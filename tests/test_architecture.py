@@ -169,13 +169,17 @@ def test_reports_have_no_torch_code() -> None:
     assert not found
 
 
+@pytest.mark.slow
 def test_planning_and_reporting_run_without_torch() -> None:
     # One process for all: each further module is checked right after its import.
     script = (
-        "import importlib, sys\n"
+        "import importlib, sys, xrgs.composing, xrgs.store.identity\n"
         f"for module in {LIGHT!r}:\n"
         "    importlib.import_module(f'xrgs.{module}')\n"
         "    heavy = {'torch', 'pycolmap', 'kornia', 'skimage'} & set(sys.modules)\n"
         "    assert not heavy, (module, heavy)\n"
+        "conf = xrgs.composing.compose('splat.backend=native', '+ablation=plus')\n"
+        "xrgs.store.identity.cell_identity(conf, 'v')\n"
+        "assert 'torch' not in sys.modules\n"
     )
     subprocess.run([sys.executable, "-P", "-c", script], check=True)

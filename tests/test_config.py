@@ -283,6 +283,7 @@ def test_a_value_that_is_missing_is_named(compose: Compose) -> None:
         compose("variant.factor=???")
 
 
+@pytest.mark.slow
 def test_every_path_may_begin_with_the_home_folder(
     compose: Compose, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -310,11 +311,13 @@ def test_configs_are_composed_where_hydra_is_in_use_and_leave_it_as_it_was(
         assert hydra.compose("mine", return_hydra_config=True).hydra.job.name == "mine"
 
 
+@pytest.mark.slow
 def test_configs_are_composed_in_threads() -> None:
     with ThreadPoolExecutor(4) as pool:
         assert [*pool.map(lambda seed: xrgs.compose(f"seed={seed}").seed, range(4))] == [0, 1, 2, 3]
 
 
+@pytest.mark.slow
 def test_a_plain_value_in_a_composed_config_is_hydras() -> None:
     """Other tests set numbers, flags and names without Hydra."""
     values = "train.steps=40 splat.backend=torch splat.densify.budget=1 threads=3 checkpoint_s=1e-9"
@@ -324,7 +327,8 @@ def test_a_plain_value_in_a_composed_config_is_hydras() -> None:
         "splat.optimizer.eps=0.5",
         "store=/a/b",
     )
-    for arm in ((), ("+ablation=mip",), ("scene=motorcycle", "preset=smoke")):
+    folder = ("scene=folder", "scene.path=/a/b")
+    for arm in ((), ("+ablation=mip",), ("scene=motorcycle", "preset=smoke"), folder):
         assert composed(*arm, *words) == composed_by_hydra(*arm, *words)
     with pytest.raises(HydraException, match=r"train\.steps=many"):
         composed("train.steps=many")

@@ -214,6 +214,7 @@ def test_a_change_of_a_plugin_is_another_cell(
     assert changed_code(before) == ([] if changed == "settings" else ["plugins/one"])
 
 
+@pytest.mark.slow
 def test_the_built_in_components_that_a_plugin_extends_are_part_of_its_code(
     install: Install, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -52,6 +52,7 @@ for names in ("load_gaussians",), ("train", "rasterize", "train"):
 """
 
 
+@pytest.mark.slow
 def test_openmps_threads_sleep_unless_the_environment_says_otherwise() -> None:
     done = python(f"import os, sys, xrgs; print(os.environ['OMP_WAIT_POLICY'])\n{USED}")
     assert (done.stdout.split(), done.stderr) == (["passive", "False", "False"], "")
@@ -59,6 +60,7 @@ def test_openmps_threads_sleep_unless_the_environment_says_otherwise() -> None:
     assert (done.stdout.split(), done.stderr) == (["active"], "")
 
 
+@pytest.mark.slow
 def test_torch_before_xrgs_is_warned_of_once_where_something_renders() -> None:
     script = f"import sys; {IMPORTED}; import xrgs\n"
     done = python(script + USED)

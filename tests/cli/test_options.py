@@ -132,7 +132,6 @@ def test_a_value_behind_an_option_may_have_an_equals_sign(
         ("render abc --size 504", "--size"),
         ("report --store=", "--store: is empty; give a path"),
         ("train garden --store=", "--store: is empty; give a path"),
-        ("data inspect garden --store=", "is empty; give a path"),
         ("bench --load=", "is empty; give a path"),
         # As of a variable that is not set: none would mean all, and an empty id begins every id.
         ("store trim --yes --sweep", "--sweep: takes a value, and none or an empty one is given"),
@@ -156,7 +155,6 @@ def test_wrong_usage_is_named_and_ends_with_2(
     [
         ("render", "give one cell or 2"),
         ("render abc", "--store xrgs-store is not a store"),
-        ("report --store gone", "--store gone is not a store"),
         ("view abc --limit 0", "--limit 0: must be at least 1"),
         ("view gone.ply", "gone.ply: cannot be read"),
         ("train . store=", "store=: is empty; give a path"),

@@ -178,7 +178,6 @@ HEAD = "# @package _global_\n"
         (HEAD + "seed: \udcff", "ablation/mine.yaml: is not in UTF-8"),
         (HEAD + "- a\n- b", "ablation/mine.yaml: is a list; it must have lines KEY: VALUE"),
         (HEAD + "train: 30", "ablation/mine.yaml: train: takes keys of its own, and not 30"),
-        (HEAD + "components: {mip: [3]}", "components.mip: takes keys of its own, and not [3]"),
         (HEAD + "just words", "ablation/mine.yaml: Key 'just words' not in"),
         (HEAD + "3", "ablation/mine.yaml: must have lines KEY: VALUE"),
     ],
@@ -252,7 +251,6 @@ def test_an_error_of_a_file_that_is_no_yaml_of_the_config_stays(tmp_path: Path) 
         (["scene=fern"], "scene=fern: there is no such choice; did you mean llff/fern?"),
         (["+steps=100"], "steps: there is no such key; did you mean train.steps"),
         (["ablaton=consistency"], "ablaton: there is no such key; did you mean ablation?"),
-        (["+ablation=consistancy"], "did you mean consistency?"),
         (["seed=["], "seed=[: "),
         (["garden"], "garden: to train on these photographs, type: xrgs-train garden"),
         (["plus"], "plus: an ablation is given as +ablation=plus"),
@@ -349,6 +347,7 @@ def test_numbers_in_a_notation_of_people_are_answered_with_the_words_to_type(
         )
 
 
+@pytest.mark.slow
 def test_words_that_a_later_one_replaces_are_said(sweep_here: RunCommand) -> None:
     """As bash makes them of `seed={0..2}`; a word that is only repeated is no mistake."""
     said = "seed is given 3 times, and seed=2 replaces the others; for all of them write seed=0,1,2"

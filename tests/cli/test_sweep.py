@@ -144,9 +144,9 @@ def test_each_arm_has_a_control_and_a_count_out_of_reach_fails_one(
 @pytest.mark.slow
 def test_a_sweep_file_plans(sweep_here: SweepHere) -> None:
     """tests/test_ablations.py composes each value of every file."""
-    code, _, err = sweep_here("+sweeps=paper_size", "scene=motorcycle", "seed=0", "dry_run=true")
+    code, _, err = sweep_here("+sweeps=captures", "scene=motorcycle", "seed=0", "dry_run=true")
     assert code == 0, err
-    assert {label.partition(" to ")[0] for label in labels(err)} == arms("paper_size")
+    assert {label.partition(" to ")[0] for label in labels(err)} == arms("captures")
 
 
 def test_every_ablation_is_in_a_sweep() -> None:

@@ -78,15 +78,13 @@ def test_the_recipe_is_for_what_the_photographs_are(
     [
         (["--recipe", "plus,exposure", "--all"],
          {"ablation": "[plus,exposure]", "variant.test_every": "0"}),
-        (["--quality=draft", "seed=3"],
-         {"train.steps": "1000", "variant.long_side": "336", "seed": "3"}),
+        (["--quality=draft"], {"train.steps": "1000", "variant.long_side": "336"}),
         (["train.steps=100"], {"splat.densify.every": "15000"}),
         (["train.steps=100", "splat.densify.every=7"], {"splat.densify.every": "7"}),
         (["size=250", "--quality", "draft", "all=true"],
          {"variant.long_side": "250", "train.steps": "1000", "variant.test_every": "0"}),
         (["--masks", "m", "+ablation=mcmc"], {"scene.masks": "m", "ablation": "mcmc"}),
         (["preset=paper", "store=other"], {"preset": "paper", "store": "other"}),
-        (["--store", "other", "variant.factor=2"], {"store": "other", "variant.factor": "2"}),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )  # fmt: skip
@@ -126,6 +124,7 @@ def test_the_command_that_minutes_prints_makes_the_same_cell(
     assert handed_over(Mixture(3, 8), *again[1:]) == chosen
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("garden")
 def test_the_user_may_replace_what_minutes_choose(
     handed_over: Callable[..., dict[str, str]],

@@ -73,7 +73,6 @@ os.kill(os.getpid(), signal.{name})
 """
     distorted = "Lens('SIMPLE_RADIAL', (9, 4, 3, 0.1), 8, 6)"
     for imports, name, thread, said in (
-        ("from xrgs.mixture import sfm", "SIGTERM", 0, ""),
         ("from xrgs.mixture import colmap", "SIGTERM", 1, ""),
         ("from xrgs.mixture import sfm", "SIGABRT", 0, "Fatal Py"),
         (f"from xrgs.photos.lens import Lens; {distorted}.kept()", "SIGTERM", 0, ""),

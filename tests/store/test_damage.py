@@ -24,7 +24,6 @@ CASES = [
     ("identity.json", "type", "", False),
     ("summary.json", "cut", "", False),
     ("summary.json", "missing", "gaussians", True),
-    ("provenance.json", "cut", "", False),
     ("provenance.json", "missing", "xrgs", True),
     ("config.json", "type", "", False),
     ("variant.json", "missing", "views", False),

@@ -11,7 +11,6 @@ import importlib
 import json
 import shutil
 import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -369,13 +368,3 @@ def test_a_native_module_that_cannot_be_loaded_is_an_error_of_one_line(
     monkeypatch.setattr(importlib, "import_module", fail)
     with pytest.raises(XrgsError, match=r"splat\.backend=native: .*GLIBC_9\.9.*install xrgs"):
         cell_id(baseline)
-
-
-@pytest.mark.slow
-def test_planning_a_native_cell_needs_no_torch() -> None:
-    script = (
-        "import sys\nfrom xrgs.composing import compose\nfrom xrgs.store import identity\n"
-        "identity.cell_identity(compose('splat.backend=native', '+ablation=plus'), 'v')\n"
-        "assert 'torch' not in sys.modules\n"
-    )
-    subprocess.run([sys.executable, "-P", "-c", script], check=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tarfile
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -28,7 +29,7 @@ def store(tmp_path: Path) -> Store:
     variant_id = write_variant(store.variants)
     (store.variants / variant_id / saved_variant.LOG).write_text(f"{tmp_path}: matched")
     for name, path in zip(CELLS, (f"{tmp_path}/data/fern", "/elsewhere/horns"), strict=True):
-        conf = composed("scene=folder", f"scene.path={path}", f"store='{store.path}'")
+        conf = replace(composed("scene=folder", f"scene.path={path}"), store=str(store.path))
         cell = finished(store.cell(name), conf, identity(0, variant_id))
         (cell.path / "log.txt").write_text(f"{tmp_path}: begun")
     command = ["+ablation=x,y", f"scene.path={tmp_path}/data/fern,/elsewhere/horns", "threads=1"]
@@ -86,6 +87,7 @@ def test_an_unpacked_store_is_the_store_trimmed(store: Store, tmp_path: Path) ->
     assert contents(again) == contents(other)
 
 
+@pytest.mark.slow
 def test_full_paths_become_relative(store: Store, tmp_path: Path) -> None:
     pack_all(store, tmp_path / "a.tar.xz")
     other = unpacked(tmp_path / "a.tar.xz", tmp_path / "other")
@@ -108,6 +110,7 @@ def test_paths_in_quotes_and_in_errors_become_relative(store: Store, tmp_path: P
     assert record.cells[1].error == "scene.path=my fern: few views"
 
 
+@pytest.mark.slow
 def test_the_records_are_those_of_the_sweeps_that_are_named(store: Store, tmp_path: Path) -> None:
     (first,) = store.sweep_ids()
     second = store.write_sweep(["+ablation=x"], [row("c1", "x")])
@@ -120,6 +123,7 @@ def test_the_records_are_those_of_the_sweeps_that_are_named(store: Store, tmp_pa
         assert {*other.sweep_ids()} == ids
 
 
+@pytest.mark.slow
 def test_what_is_damaged_is_left_out_and_named(store: Store, tmp_path: Path) -> None:
     (store.cell("c1").path / "scores.csv").write_text("view,psnr\na,21\n")
     (variant_id,) = list_names(store.variants)
@@ -135,6 +139,7 @@ def test_what_is_damaged_is_left_out_and_named(store: Store, tmp_path: Path) -> 
     assert other.cell_folders() == [CellFolder(other.cells_folder / "c2")]
 
 
+@pytest.mark.slow
 def test_what_can_not_be_written_is_named_and_an_old_archive_is_kept(
     store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -48,7 +48,8 @@ def made_again(tmp_path: Path, stereo_scene: SceneConf, small_conf: Conf) -> Res
     def run(folder: Path, scene: SceneConf = stereo_scene, conf: VariantConf | None = None) -> None:
         work = tmp_path / "work"
         work.mkdir(exist_ok=True)
-        trimming.restore_images(folder, scene, conf or small_conf(scene), work, tmp_path)
+        scenes = tmp_path / "store" / "scenes"  # of `build`, which has rendered them
+        trimming.restore_images(folder, scene, conf or small_conf(scene), work, scenes)
 
     return run
 

@@ -408,7 +408,7 @@ def test_other_instruction_sets_build_the_same_variant(
     OpenBLAS and MKL are pinned. Left free, MKL renders other photographs on most processors.
     """
     changes = ("variant.long_side=200", "variant.sfm.reference=false")
-    conf = compose("scene=procedural", "scene.views=6", *changes)
+    conf = compose("scene=procedural", "scene.views=4", *changes)
     older = {
         "ATEN_CPU_CAPABILITY": "avx2",
         "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX512F,-AVX512VL",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import os
 import struct
+import sys
 import threading
 from collections import defaultdict
 from collections.abc import Callable, Iterator
@@ -75,6 +76,8 @@ class Swept:
 @pytest.fixture
 def swept(cells: Any, monkeypatch: pytest.MonkeyPatch) -> Swept:
     """An empty store, and no tracker's server in the environment."""
+    # W&B goes on without its launcher, whose import takes seconds.
+    monkeypatch.setitem(sys.modules, "wandb.sdk.launch.inputs.internal", None)
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
     monkeypatch.setenv("WANDB_MODE", "offline")
     return Swept(cells)
