@@ -114,14 +114,13 @@ def test_seeds_share_one_composed_config_and_each_cell_is_identified_once(
 def test_cells_that_differ_in_numbers_share_one_config_and_get_their_own_values(
     study: Callable[..., Study],
 ) -> None:
-    made = study("preset=laptop")
+    made = study()
     plan = made._plan(["preset=laptop", "variant.factor=2,5", "variant.hr_fraction=0.1,0.5"])
     assert [cell.conf for cell in plan] == [
         composed_by_hydra(*cell.spec.overrides) for cell in plan
     ]
     assert len(plan) == 4
-    # That of the command line, which has been composed for the sweeper.
-    assert len(made._context.config_loader.composed) == 0  # type: ignore[attr-defined]
+    assert len(made._context.config_loader.composed) == 1  # type: ignore[attr-defined]
     with pytest.raises(XrgsError, match=r"^variant.factor=0: "):
         made._plan(["variant.factor=2,0"])
     with pytest.raises(XrgsError, match=r"pa/room and .*pb/room: both are called room"):

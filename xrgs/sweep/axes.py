@@ -100,12 +100,6 @@ def expand(arguments: Sequence[str], loader: ConfigLoader | None = None) -> list
     return list(specs)
 
 
-def fixed_words(words: Sequence[str], loader: ConfigLoader) -> set[str]:
-    """Return the words of a command line that are no axes, as they are in every cell of it."""
-    overrides = parsed(words, loader)
-    return {text for o in overrides if not o.is_sweep_override() for text in _values(o)}
-
-
 def _values(override: Override) -> list[str]:
     """Return one override for each value of an axis."""
     key = override.get_key_element()

@@ -24,7 +24,6 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any, cast
 
@@ -37,7 +36,7 @@ from omegaconf import DictConfig, OmegaConf, flag_override
 from omegaconf.errors import OmegaConfBaseException
 
 from xrgs.composing import escape_interpolations, to_conf
-from xrgs.config import GROUPS, Conf, known_keys
+from xrgs.config import Conf
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.evaluation.lpips import weights
 from xrgs.photos import scenes
@@ -53,7 +52,7 @@ from xrgs.store.attempts import plan_cell
 from xrgs.store.store import Store, StoreGoneError
 from xrgs.sweep import launchers, track
 from xrgs.sweep import plan as plans
-from xrgs.sweep.axes import CellSpec, effective, expand, fixed_words
+from xrgs.sweep.axes import CellSpec, effective, expand
 from xrgs.sweep.estimate import CostEstimator
 from xrgs.sweep.job import (
     FAIL_FAST,
@@ -272,26 +271,16 @@ class Study:
             self._confs[overrides] = conf
         return self._confs[overrides]
 
-    @cached_property
-    def _fixed_words(self) -> set[str]:
-        return fixed_words(self._config.hydra.overrides.task, self._context.config_loader)
-
     def _hydra_config(self, overrides: tuple[str, ...]) -> DictConfig:
         """Return Hydra's config. Configs that differ only in numbers share one composition.
 
-        Composing takes 0.1 s. The words that are no axes have been composed for the sweeper; a
-        cell that adds only numbers to them begins with that config.
+        Composing takes 0.1 s.
         """
         numbers = {text: match for text in overrides if (match := _NUMBER.fullmatch(text))}
         shared = tuple(numbers[text][1] if text in numbers else text for text in overrides)
         if shared not in self._composed:
             loader = self._context.config_loader
-            given = self._fixed_words
-            axes = {numbers[text][1] if text in numbers else "" for text in {*overrides} - given}
-            if given.issubset(overrides) and axes.issubset({*known_keys()} - {*GROUPS}):
-                self._composed[shared] = copy.deepcopy(self._config)
-            else:
-                self._composed[shared] = loader.load_sweep_config(self._config, [*overrides])
+            self._composed[shared] = loader.load_sweep_config(self._config, [*overrides])
         composed = self._composed[shared]
         for match in numbers.values():
             OmegaConf.update(composed, match[1], json.loads(match[2]))  # ${seed} follows seed
