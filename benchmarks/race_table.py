@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib import style
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from xrgs.report.inference import difference, half_width, log_ratio
@@ -124,7 +125,7 @@ def write(folder: Path, page: Path | None, against: str) -> None:
     write_text(folder / "table.md", f"{text}\n")
     picture = folder / "race.png"
     with atomic_writer(picture) as stream, style.context("default"):
-        figure(runs).savefig(stream, format="png", dpi=150, metadata={"Software": "xrgs"})
+        FigureCanvasAgg(figure(runs)).print_png(stream, metadata={"Software": "xrgs"})
     if page is not None:
         content = page.read_text(encoding="utf-8")
         shown = f"![Quality over minutes]({os.path.relpath(picture, page.parent)})\n\n{text}\n"
@@ -207,7 +208,7 @@ def notes(runs: Sequence[Run]) -> list[str]:
 def figure(runs: Sequence[Run]) -> Figure:
     """Draw PSNR and LPIPS over minutes, a row of panels for each size."""
     sizes = sorted({size for size, _ in budgets(runs)})
-    drawn = Figure(figsize=(11, 4.2 * len(sizes)), layout="constrained")
+    drawn = Figure(figsize=(11, 4.2 * len(sizes)), dpi=150, layout="constrained")
     panels = drawn.subplots(len(sizes), 2, squeeze=False)
     for row, size in zip(panels, sizes, strict=True):
         for axes, (score, name) in zip(row, _PANELS.items(), strict=True):

@@ -112,8 +112,9 @@ def test_photographs_of_fern_are_registered_at_a_reduced_size(
     files = sorted((data_root / "llff" / "fern" / "images_4").glob("*"))[:4]
     if not files:
         pytest.skip("fern is not there")
+    (tmp_path / "fern").mkdir()
     for file in files:
-        images.save(tmp_path / "fern" / f"{file.stem}.png", images.read(file))
+        (tmp_path / "fern" / file.name).symlink_to(file)
     few = {"max_num_features": 1500, "long_side": 504}
     built = build(scene_conf("folder", tmp_path / "fern", name="fern"), sfm=few)
     assert built.report["registered"] == 4

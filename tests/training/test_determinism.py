@@ -57,7 +57,7 @@ PROCESSORS = [
             "ATEN_CPU_CAPABILITY": CAPABILITIES[place % len(CAPABILITIES)],
             **LIBRARIES[place % len(LIBRARIES)],
         },
-        [number for number in (1, 2, 3) if (number - 1) % PLACES == place],
+        [number for number in (1, 2) if (number - 1) % PLACES == place],
         # Who has the others has no processor without them, and trains as they do.
         marks=pytest.mark.exhaustive
         if place and CAPABILITIES[place % len(CAPABILITIES)] == "default"

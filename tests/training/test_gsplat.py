@@ -82,7 +82,7 @@ def test_training_leaves_no_tensor_on_the_processor_and_a_killed_run_continues(
         *TRAININGS[training],
     )
     with stand_in(DEVICE.type), fake_gpu():
-        if training == "xrgs":
+        if training == "plus":
             result, _ = killed_and_not(masked(data), conf, losses, tmp_path)
         else:
             result = train(masked(data), conf)

@@ -278,12 +278,12 @@ ACTS_HERE = {
 }
 
 
-SHORT = ("train.steps=20", "splat.backend=auto")
+SHORT = ("train.steps=12", "splat.backend=auto")
 
 
 @pytest.fixture(scope="module")
 def plain() -> Gaussians:
-    """What the baseline makes of `data` in 20 steps."""
+    """What the baseline makes of `data` in 12 steps."""
     return train_cell(ramps(), compose(*SHORT)).gaussians
 
 
@@ -297,7 +297,7 @@ def test_each_ablation_changes_the_result(data: Dataset, plain: Gaussians, ablat
 
 
 def test_every_ablation_trains_with_plus_exposure_and_masks(data: Dataset) -> None:
-    """Their 20 steps go through densification, selection and the late factor of `supersampled`."""
+    """Their 12 steps go through densification, selection and the late factor of `supersampled`."""
     others = ",".join(sorted({*ABLATIONS} - IN_PLUS - {"mcmc", "count_matched", "exposure_gain"}))
     conf = compose(*SHORT, f"+ablation=[plus,{others},xrgs_per_class,hybrid_schedule]")
     result = train(masked(data), conf)

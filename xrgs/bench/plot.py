@@ -34,7 +34,8 @@ def draw(results: Mapping[str, Any]) -> bytes:
         The bytes of a PNG.
     """
     stream = io.BytesIO()
-    draw_figure(results).savefig(stream, format="png", dpi=_DPI, metadata={"Software": SOFTWARE})
+    # Not savefig, which gives the same bytes and draws twice: the first time only for the layout.
+    FigureCanvasAgg(draw_figure(results)).print_png(stream, metadata={"Software": SOFTWARE})
     return stream.getvalue()
 
 
@@ -58,8 +59,8 @@ def draw_figure(results: Mapping[str, Any]) -> Figure:
     panels.append(partial(_draw_steps, rows=results["steps"]))
     columns = len(panels) // 2
     with style.context("default"):  # independent of the user's style
-        figure = Figure(figsize=(_SIZE[0] * columns, _SIZE[1] * 2), layout="constrained")
-        FigureCanvasAgg(figure)
+        size = (_SIZE[0] * columns, _SIZE[1] * 2)
+        figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
         for number, panel in enumerate(panels, start=1):
             panel(figure.add_subplot(2, columns, number))
     return figure

@@ -138,7 +138,12 @@ def test_the_loupe_moves_in_all_pictures_at_once_by_keyboard(opened: Any) -> Non
     assert opened.execute_script(places) == [None] * 8
 
 
-def test_a_table_sorts_and_filters(opened: Any) -> None:
+def test_a_table_sorts_and_a_filter_holds_for_tables_and_curves(opened: Any) -> None:
+    lines = (
+        "return document.querySelectorAll('#curves-body .chart')[arguments[0]]"
+        ".querySelectorAll('polyline').length"
+    )
+    assert [opened.execute_script(lines, place) for place in range(2)] == [3, 3], "of each label"
     numbers = [float(text) for text in column(opened, "#scores-table", 5)]
     assert len(numbers) == 6
     heads = opened.find_elements("css selector", "#scores-table thead button")
@@ -150,6 +155,7 @@ def test_a_table_sorts_and_filters(opened: Any) -> None:
     choose(opened, "#filter-label", "consistency")
     choose(opened, "#filter-metric", "PSNR")
     assert column(opened, "#changes-table", 0) == ["consistency"]
+    assert opened.execute_script(lines, 0) == 2
     assert set(column(opened, "#scores-table", 2)) == {"baseline", "consistency"}
 
 
@@ -164,16 +170,6 @@ def test_a_figure_of_the_paper_shows_its_counterpart(opened: Any) -> None:
         "return [...document.querySelectorAll('#training .stage .side')].map(s => s.textContent)"
     )
     assert opened.execute_script(texts) == ["LR photograph", "consistency"]
-
-
-def test_curves_have_a_line_for_each_label(opened: Any) -> None:
-    lines = (
-        "return document.querySelectorAll('#curves-body .chart')[arguments[0]]"
-        ".querySelectorAll('polyline').length"
-    )
-    assert [opened.execute_script(lines, place) for place in range(2)] == [3, 3]
-    choose(opened, "#filter-label", "consistency")
-    assert opened.execute_script(lines, 0) == 2
 
 
 def test_it_fits_a_phone(opened: Any) -> None:
@@ -201,10 +197,12 @@ def dequantised(model: dict[str, Any]) -> Gaussians:
     return Gaussians(**{name: torch.from_numpy(a).float() for name, a in arrays.items()})
 
 
-def test_the_3d_view_shows_what_the_rasterizer_renders(
+def test_the_3d_view_shows_what_the_rasterizer_renders_and_both_turn_together(
     opened: Any, page: Path, cameras: Dataset
 ) -> None:
     """Independent truth: our own rasterizer, at the size of the canvas, from the same camera."""
+    from selenium.webdriver.common.keys import Keys
+
     canvas_pixels(opened)
     opened.execute_script("document.querySelector('#splats input[type=checkbox]').click()")
     shown = canvas_pixels(opened)
@@ -219,15 +217,8 @@ def test_the_3d_view_shows_what_the_rasterizer_renders(
     assert len(np.unique(shown.reshape(-1, 3), axis=0)) > 100
     # The canvas rounds to 8 bits after each Gaussian.
     assert np.sqrt(np.mean((shown - truth) ** 2)) < 0.01
-
-
-def test_both_3d_views_turn_together(opened: Any) -> None:
-    from selenium.webdriver.common.keys import Keys
-
-    before = canvas_pixels(opened)
     opened.find_elements("css selector", ".pair canvas")[1].send_keys(Keys.ARROW_LEFT)
-    after = canvas_pixels(opened)
-    assert np.abs(after - before).mean() > 0.005
+    assert np.abs(canvas_pixels(opened) - shown).mean() > 0.005
 
 
 def test_the_page_of_one_cell_works_and_has_no_tags_where_photographs_are_alike(

@@ -68,6 +68,7 @@ def test_the_page_of_one_cell_shows_the_scene_and_no_furniture_of_a_comparison(a
         assert not {"HR", "LR"} & set(re.findall(r"\w+", words))
 
 
+@pytest.mark.parametrize("alone", ["alike"], indirect=True)
 def test_the_page_of_one_cell_says_how_the_scene_was_placed(alone: Path, tmp_path: Path) -> None:
     store = Path(shutil.copytree(alone.parent.parent / "store", tmp_path / "store"))
     (report,) = store.glob("variants/0123*/report.json")

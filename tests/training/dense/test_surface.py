@@ -110,12 +110,12 @@ def test_most_depths_are_good_and_nearly_exact(
 
 @pytest.mark.slow
 def test_fine_depths_are_exact_to_half_a_pixel_at_the_usual_size() -> None:
-    """10 of 24 views at 504 px, as `scene=procedural` has them: HR views are swept at 252 px."""
-    scene = true_scene(24, 504, samples=2, part=slice(9, 19))
+    """7 of 24 views at 504 px, as `scene=procedural` has them: HR views are swept at 252 px."""
+    scene = true_scene(24, 504, samples=2, part=slice(9, 16))
     views = swept_views(scene.data.train, "native")
     maps = find_depths(views, scene.data.points.double().numpy(), "native")
     fine = [errors(scene, n, each)[0] for n, each in maps.items() if each.view.fine is not None]
-    assert len(fine) == 4
+    assert len(fine) == 3
     assert np.median(np.concatenate(fine)) < 0.5
 
 
