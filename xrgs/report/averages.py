@@ -6,9 +6,7 @@ Averages are taken of the effect of a pair: a difference in dB, or log(value / b
 
 from __future__ import annotations
 
-import math
-from collections.abc import Collection, Iterable, Sequence
-from typing import Any
+from collections.abc import Collection
 
 import numpy as np
 import pandas as pd
@@ -17,13 +15,11 @@ from xrgs.report.inference import half_width, p_values, prediction_half_width, s
 
 _SCENE = ["label", "condition", "scene", "metric"]
 _MEAN = ["label", "condition", "metric"]
-_AVERAGED = ["base", "value", "effect"]
-_COUNTS = ["n", "up", "down", "scenes", "pairs"]
-_SCATTERS = ["scatter_replicates", "scatter_scenes"]
 #: Columns in the unit of the effect, which are shown in percent if the effect is a logarithm.
-_EFFECTS = ["change", "low", "high", "new_low", "new_high", *_SCATTERS]
-
-_Row = dict[str, Any]
+_EFFECTS = [
+    *("change", "low", "high", "new_low", "new_high"),
+    *("scatter_replicates", "scatter_scenes"),
+]
 
 
 def averaged(pairs: pd.DataFrame, ratios: Collection[str]) -> tuple[pd.DataFrame, pd.DataFrame]:
@@ -49,104 +45,72 @@ def averaged(pairs: pd.DataFrame, ratios: Collection[str]) -> tuple[pd.DataFrame
 
         `p` belongs to the t-test of the interval, `p_sign` to the sign test.
     """
-    rows = pairs[[*_SCENE, *_AVERAGED, "why"]].to_dict("records")
-    scenes = [_over_replicates(of) for of in _grouped(rows, _SCENE)]
-    means = [_over_scenes(of) for of in _grouped(scenes, _MEAN)]
-    return _with_tests(scenes, _SCENE, ratios), _with_tests(means, _MEAN, ratios)
+    scenes = _means(pairs, _SCENE)
+    scenes = scenes.assign(
+        unit="replicates",
+        scenes=scenes["n"].clip(upper=1),
+        pairs=scenes["n"],
+        scatter_replicates=scenes["spread"],
+        scatter_scenes=np.nan,
+    )
+    means = _over_scenes(scenes.reset_index())
+    return _with_tests(scenes, ratios), _with_tests(means, ratios)
 
 
-def _grouped(rows: Iterable[_Row], by: list[str]) -> Iterable[list[_Row]]:
-    """Return the rows that share the keys `by`, in the order of the first ones."""
-    groups: dict[tuple[str, ...], list[_Row]] = {}
-    for row in rows:
-        groups.setdefault(tuple(row[name] for name in by), []).append(row)
-    return groups.values()
-
-
-def _mean(rows: Sequence[_Row]) -> _Row:
-    """Return the means of rows, with `spread`, `n`, `up` and `down`, and the keys of the first.
+def _means(rows: pd.DataFrame, by: list[str]) -> pd.DataFrame:
+    """Return the means of the rows that share the keys `by`, with `spread`, `n`, `up` and `down`.
 
     Rows without an effect are left out of every mean; `why` says why they have none.
     """
-    complete = [row for row in rows if not math.isnan(row["effect"])]
-    effects, n = [row["effect"] for row in complete], len(complete)
-    means = {name: _sum(row[name] for row in complete) / n if n else np.nan for name in _AVERAGED}
-    return (
-        {name: rows[0][name] for name in _SCENE}
-        | means
-        | {
-            "spread": _deviation(effects),
-            "n": n,
-            "up": sum(effect > 0 for effect in effects),
-            "down": sum(effect < 0 for effect in effects),
-            "why": "; ".join(dict.fromkeys(row["why"] for row in rows if row["why"])),
-        }
+    has_effect = rows["effect"].notna()
+    numbers = ["base", "value"]
+    signs = {"up": rows["effect"] > 0, "down": rows["effect"] < 0}
+    grouped = rows.assign(**rows[numbers].where(has_effect), **signs).groupby(by, sort=False)
+    table = grouped[[*numbers, "effect"]].mean()
+    incomplete = rows[rows["why"] != ""].drop_duplicates([*by, "why"])
+    why = incomplete.groupby(by, sort=False)["why"].agg("; ".join)
+    return table.assign(
+        spread=grouped["effect"].std(),
+        n=grouped["effect"].count(),
+        up=grouped["up"].sum(),
+        down=grouped["down"].sum(),
+        why=why.reindex(table.index).fillna(""),
     )
 
 
-def _over_replicates(pairs: Sequence[_Row]) -> _Row:
-    """Return means over the pairs of a scene."""
-    mean = _mean(pairs)
-    mean |= {"unit": "replicates", "scenes": min(mean["n"], 1), "pairs": mean["n"]}
-    return mean | {"scatter_replicates": mean["spread"], "scatter_scenes": np.nan}
-
-
-def _over_scenes(scenes: Sequence[_Row]) -> _Row:
+def _over_scenes(scenes: pd.DataFrame) -> pd.DataFrame:
     """Return means over scenes; a single scene keeps its own values, which are replicates."""
-    mean = _mean(scenes)
-    several = [scene for scene in scenes if scene["n"] > 1]
-    squares = _sum((scene["n"] - 1) * scene["spread"] ** 2 for scene in several)
-    freedom = sum(scene["n"] - 1 for scene in several)
-    pooled = math.sqrt(squares / freedom) if several else np.nan
-    mean |= {"unit": "scenes", "scenes": mean["n"], "pairs": sum(s["pairs"] for s in scenes)}
-    mean |= {"scatter_replicates": pooled, "scatter_scenes": mean["spread"]}
-    if mean["n"] == 1:
-        (single,) = (scene for scene in scenes if scene["n"])
-        mean |= {name: single[name] for name in ("spread", "n", "up", "down", "unit")}
-    return mean
+    means = _means(scenes, _MEAN)
+    means = means.assign(scatter_scenes=means["spread"], scenes=means["n"], unit="scenes")
+    means["pairs"] = scenes.groupby(_MEAN, sort=False)["pairs"].sum()
+    freedom = (scenes["n"] - 1).clip(lower=0)
+    squares = scenes.assign(squares=freedom * scenes["spread"] ** 2, freedom=freedom)
+    pooled = squares.groupby(_MEAN, sort=False)[["squares", "freedom"]].sum()
+    means["scatter_replicates"] = np.sqrt(pooled["squares"] / pooled["freedom"])  # NaN for 0 / 0
+    single = scenes[scenes["effect"].notna()].drop_duplicates(_MEAN, keep=False).set_index(_MEAN)
+    columns = ["spread", "n", "up", "down", "unit"]
+    means.loc[single.index, columns] = single[columns]
+    return means
 
 
-def _sum(values: Iterable[float]) -> float:
-    """Return Kahan's sum, which is what pandas computes."""
-    total = lost = 0.0
-    for value in values:
-        exact = value - lost
-        lost = (total + exact) - total - exact
-        total += exact
-    return total
-
-
-def _deviation(values: Sequence[float]) -> float:
-    """Return Welford's sample standard deviation, as pandas does; NaN for fewer than two values."""
-    mean = squares = 0.0
-    for n, value in enumerate(values, 1):
-        off = value - mean
-        mean += off / n
-        squares += off * (value - mean)
-    return math.sqrt(squares / (len(values) - 1)) if len(values) > 1 else np.nan
-
-
-def _with_tests(rows: Sequence[_Row], by: list[str], ratios: Collection[str]) -> pd.DataFrame:
-    """Return rows as a table, with changes, intervals and the p of their tests, not corrected."""
-    kinds = dict.fromkeys([*_AVERAGED, "spread", *_SCATTERS], float) | dict.fromkeys(_COUNTS, int)
-    table: dict[str, Any] = {
-        name: np.array([row[name] for row in rows], dtype=kinds.get(name, object))
-        for name in (*by, *kinds, "unit", "why")
-    }
-    effect, spread, n = table["effect"], table["spread"], table["n"].astype(float)
+def _with_tests(means: pd.DataFrame, ratios: Collection[str]) -> pd.DataFrame:
+    """Return the means with changes, intervals and the p of their tests, not yet corrected."""
+    names = ("effect", "spread", "n", "up", "down")
+    effect, spread, n, up, down = (means[name].to_numpy(np.float64) for name in names)
     half = half_width(spread, n)
-    new = np.where(table["unit"] == "scenes", prediction_half_width(spread, n), np.nan)
-    table |= {
-        "change": effect,
-        "low": effect - half,
-        "high": effect + half,
-        "new_low": effect - new,
-        "new_high": effect + new,
-        "p": p_values(effect, spread, n),
-        "p_sign": sign_test(table["up"], table["down"]),
-    }
-    is_ratio = np.isin(table["metric"], list(ratios))
+    new = np.where(means["unit"] == "scenes", prediction_half_width(spread, n), np.nan)
+    means = means.assign(
+        change=effect,
+        low=effect - half,
+        high=effect + half,
+        new_low=effect - new,
+        new_high=effect + new,
+        p=p_values(effect, spread, n),
+        p_sign=sign_test(up, down),
+    )
+    is_ratio = means.index.get_level_values("metric").isin(ratios)
     with np.errstate(over="ignore"):  # an interval of two values may end at infinity
-        for name in _EFFECTS:
-            table[name] = np.where(is_ratio, 100 * np.expm1(table[name]), table[name])
-    return pd.DataFrame(table).set_index(by)
+        percent = {name: 100 * np.expm1(means[name]) for name in _EFFECTS}
+    return means.assign(
+        **{name: np.where(is_ratio, percent[name], means[name]) for name in _EFFECTS}
+    )
