@@ -239,6 +239,7 @@ def git(folder: Path, *arguments: str) -> str:
     return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
 
 
+@pytest.mark.slow
 def test_a_build_carries_the_commit_where_it_can_and_leaves_no_file(
     backend: Any, scikit_build: ScikitBuild, checkout: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

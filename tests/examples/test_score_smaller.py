@@ -29,6 +29,7 @@ def ssim_of(*images: NDArray[np.float64]) -> float:
     return value
 
 
+@pytest.mark.slow
 def test_views_are_scored_at_both_sizes(
     script: Callable[[str], ModuleType], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

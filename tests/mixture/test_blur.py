@@ -90,6 +90,7 @@ def test_a_known_blur_is_found_through_noise_and_jpeg(
     assert len(blur_notes(found)) == (expected > 0.5)
 
 
+@pytest.mark.slow
 def test_sharp_kernels_are_not_called_blurry(views_of: Callable[..., list[View]]) -> None:
     high, low = [texture(seed) for seed in range(3)], [texture(seed) for seed in range(3, 9)]
     found = {how: estimated(views_of(high, low, how)) for how in ("downsample", "lanczos", "box")}
@@ -109,6 +110,7 @@ def test_without_both_classes_or_enough_pixels_nothing_is_said(
     assert blur_notes(None) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scene", "how", "expected"),
     [("fern", "downsample", None), ("horns", "box", None), ("fern", "phone", 0.85)],

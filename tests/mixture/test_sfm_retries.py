@@ -81,6 +81,7 @@ def registered(views: int, points: int = 0) -> Reconstruction:
     )
 
 
+@pytest.mark.slow
 def test_attempts_follow_until_one_is_accepted(
     photos: PhotoCollection, sfm_conf: SfmConf, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

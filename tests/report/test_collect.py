@@ -98,6 +98,7 @@ def test_rows_that_contradict_each_other_can_be_left_out(two: tuple[Path, str, s
         build(b, both, pictures=[], choice=Choice(scenes=("fern",)))
 
 
+@pytest.mark.slow
 def test_a_sweep_that_runs_is_reported_with_what_is_done(made: Any) -> None:
     for seed in range(2):
         made.add(seed=seed)

@@ -81,6 +81,7 @@ def test_gradients_of_quaternions_of_any_length(backend: str, exponents: list[in
         assert error < 2e-3 * true["quats"].abs().max(), exponent
 
 
+@pytest.mark.slow
 @FEW
 @given(
     exponents=st.lists(st.integers(-60, 56), min_size=5, max_size=5),

@@ -112,6 +112,7 @@ def whole(conf: Conf, root: Path) -> dict[str, Any]:
     return results(folder)
 
 
+@pytest.mark.slow
 def test_a_cell_killed_in_training_and_again_in_evaluation_goes_on(
     conf: Conf,
     tmp_path: Path,
@@ -132,6 +133,7 @@ def test_a_cell_killed_in_training_and_again_in_evaluation_goes_on(
     assert [path.name for path in folder.path.parent.iterdir()] == [folder.id]  # nothing aside
 
 
+@pytest.mark.slow
 def test_a_cell_that_goes_on_elsewhere_names_both_machines(conf: Conf, tmp_path: Path) -> None:
     killed(conf, tmp_path, 6)
     several = ["threads 1", "threads 2"]
@@ -182,6 +184,7 @@ def test_an_unusable_checkpoint_is_logged_and_training_starts_over(
     assert results(folder) == whole(conf, tmp_path / "b")
 
 
+@pytest.mark.slow
 def test_the_test_views_are_scored_during_training_and_nothing_else_changes(
     conf: Conf, tmp_path: Path
 ) -> None:

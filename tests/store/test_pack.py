@@ -52,6 +52,7 @@ def contents(store: Store) -> dict[str, bytes]:
     return {str(path.relative_to(store.path)): path.read_bytes() for path in files}
 
 
+@pytest.mark.slow
 def test_an_unpacked_store_is_the_store_trimmed(store: Store, tmp_path: Path) -> None:
     before = contents(store)
     packed = pack_all(store, tmp_path / "a.tar.xz")

@@ -50,6 +50,7 @@ def simulated_training(
     return train_at, thresholds
 
 
+@pytest.mark.slow
 @given(
     power=st.floats(0.4, 4.0),
     at_start=st.integers(2_000, 1_000_000),
@@ -154,6 +155,7 @@ def test_the_matched_run_is_the_plain_run_with_its_threshold(
     assert same(loop.train(data, short).gaussians, matched.gaussians)
 
 
+@pytest.mark.slow
 def test_mcmc_takes_the_count_as_its_budget(data: Dataset) -> None:
     overrides = "train.steps=60", "splat.densify.every=1500", "splat.backend=auto"
     conf = compose("+ablation=mcmc", *overrides)

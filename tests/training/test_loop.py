@@ -180,6 +180,7 @@ def test_hooks_are_called_in_the_documented_order(data: Dataset) -> None:
     assert names[begin:-2] == documented
 
 
+@pytest.mark.slow
 def test_evaluation_changes_no_bit_takes_no_time_and_sees_what_would_be_saved(
     data: Dataset, short: Conf, monkeypatch: pytest.MonkeyPatch
 ) -> None:

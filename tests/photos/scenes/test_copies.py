@@ -236,6 +236,7 @@ def test_of_heic_and_jpeg_of_one_name_one_is_taken(
     assert "IMG_0.HEIC (of IMG_0.jpg)" in found.notes[0]
 
 
+@pytest.mark.slow
 @pytest.mark.data
 def test_neighbouring_views_of_two_cameras_and_of_a_burst_stay(
     data_root: Path, tmp_path: Path

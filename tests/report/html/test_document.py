@@ -46,6 +46,7 @@ class Parsed(HTMLParser):
         self.texts.setdefault(self._open, []).append(data)
 
 
+@pytest.mark.slow
 def test_the_page_of_one_cell_shows_the_scene_and_no_furniture_of_a_comparison(alone: Path) -> None:
     parsed = Parsed(alone.read_text())
     order = [attributes["id"] for tag, attributes in parsed.tags if tag == "section"]
@@ -68,6 +69,7 @@ def test_the_page_of_one_cell_shows_the_scene_and_no_furniture_of_a_comparison(a
         assert not {"HR", "LR"} & set(re.findall(r"\w+", words))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("alone", ["alike"], indirect=True)
 def test_the_page_of_one_cell_says_how_the_scene_was_placed(alone: Path, tmp_path: Path) -> None:
     store = Path(shutil.copytree(alone.parent.parent / "store", tmp_path / "store"))

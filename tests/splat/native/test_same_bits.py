@@ -139,6 +139,7 @@ def restored() -> Iterator[None]:
     torch.set_num_threads(threads)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("restored")
 @pytest.mark.parametrize("name", OPERATIONS)
 def test_threads_and_instruction_sets_change_no_bit(name: str) -> None:

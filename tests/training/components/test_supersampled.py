@@ -176,6 +176,7 @@ def test_the_variances_of_a_blur_and_of_the_box_of_a_pixel_add_up() -> None:
     assert found(render, taken(render, 0.8, 1.5)) == pytest.approx(expected, rel=0.04)
 
 
+@pytest.mark.slow
 def test_the_widths_that_fit_best_are_those_of_the_photograph() -> None:
     render, truth = fine_image(100, 120), (0.85, 0.4)
     variances = (5 * torch.tensor(truth, dtype=torch.float64)).square()

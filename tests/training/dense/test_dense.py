@@ -51,6 +51,7 @@ def test_sfm_points_come_first_and_squares_fill_the_budget(
     assert losses[1].history[0]["loss"] < 0.6 * losses[0].history[0]["loss"]
 
 
+@pytest.mark.slow
 def test_any_number_of_threads_gives_the_same_bits(scene: TrueScene) -> None:
     data = replace(scene.data, train=scene.data.train[:5])
     threads = torch.get_num_threads()
