@@ -593,8 +593,8 @@ def _prepared(
 ) -> Callable[[], object]:
     """Return the `main` of a command, for which this process is prepared until the patch ends."""
     main: Callable[[], object] = importlib.import_module(f"xrgs.cli.{name}").main
-    for module in (name, "sweep"):  # pytest keeps its own handlers of signals
-        patch.setattr(f"xrgs.cli.{module}.exit_on_signal", nullcontext, raising=False)
+    for module in ("options", "sweep"):  # pytest keeps its own handlers of signals
+        patch.setattr(f"xrgs.cli.{module}.exit_on_signal", nullcontext)
     patch.chdir(folder)
     patch.setenv("OMP_WAIT_POLICY", os.environ.get("OMP_WAIT_POLICY", "passive"))
     patch.setattr(sys, "argv", [f"xrgs-{name}", *arguments])

@@ -131,6 +131,7 @@ def test_results_that_cant_be_written_are_refused_before_any_measurement(
     ("arguments", "message"),
     [
         (["--save=a.npz"], "--save FILE.npz needs --cell FOLDER and --view NAME"),
+        (["--cell=a", "--view=b"], "--cell and --view are for --save FILE.npz"),
         (["--save=a.npz", "--cell=nowhere", "--view=a"], "--cell nowhere: is absent"),
         (["--repeats=0"], "--repeats 0: must be at least 1"),
         (["--threads=-1"], "--threads -1: must be at least 0"),

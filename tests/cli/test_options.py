@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -14,6 +15,7 @@ from typing import get_args, get_type_hints
 import pytest
 
 import xrgs
+from tests.runtime.programs import run_python
 from xrgs.cli.options import errors_as_messages
 from xrgs.cli.render import render
 from xrgs.errors import XrgsError
@@ -126,7 +128,8 @@ def test_a_value_behind_an_option_may_have_an_equals_sign(
         ("report --aginst x", "--against LABEL"),
         ("store", "Missing subcommand"),
         ("store remove", "Available subcommands: list, show, rm"),
-        ("store show", "CELL"),
+        ("store pack", "--out FILE.tar.xz"),
+        ("store show --cell a", "--cell"),
         ("data download", "{llff}"),
         ("data export a --format obj", "'colmap', 'nerfstudio'"),
         ("render abc --size 504", "--size"),
@@ -154,6 +157,11 @@ def test_wrong_usage_is_named_and_ends_with_2(
     ("words", "message"),
     [
         ("render", "give one cell or 2"),
+        ("train --dry-run", "give a folder of photographs, or a video"),
+        ("data inspect", "inspect: give a folder of photographs, a variant, a cell, or overrides"),
+        ("data export --out a.ply", "export: give a cell, a variant, or a file of Gaussians"),
+        ("store show", "show: give a cell"),
+        ("store import", "import: give an archive, or the folder of a store"),
         ("render abc", "--store xrgs-store is not a store"),
         ("view abc --limit 0", "--limit 0: must be at least 1"),
         ("view gone.ply", "gone.ply: cannot be read"),
@@ -180,6 +188,25 @@ def test_an_error_is_one_line_and_no_other_exception_is_hidden() -> None:
     assert end.value.code == "xrgs-x: two lines"
     with pytest.raises(ZeroDivisionError), errors_as_messages("xrgs-x"):
         raise ZeroDivisionError
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("script", "code", "message"),
+    [
+        ("import xrgs.cli; {stop}", -signal.SIGINT, ""),  # as during the imports of a command
+        (
+            "from xrgs.cli import options\ndef f(): {stop}\noptions.run('xrgs-x', f, hint='Go.')",
+            128 + signal.SIGINT,
+            "stopped by SIGINT. Go.\n",
+        ),
+    ],
+)
+def test_ctrl_c_ends_a_command_without_a_traceback(script: str, code: int, message: str) -> None:
+    stop = "signal.raise_signal(signal.SIGINT)"
+    begin = "import signal, sys\nsys.argv = ['xrgs-x']\n"
+    done = run_python(begin + script.format(stop=stop))
+    assert (done.returncode, done.stderr) == (code, message)
 
 
 def test_the_paths_of_a_film_can_all_be_chosen() -> None:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
+import pytest
 import torch
 from PIL import Image
 from scipy.spatial import cKDTree
 
+from xrgs.errors import XrgsError
 from xrgs.formats.gsplat_api import rasterization
 from xrgs.mixture.colmap import read_points
 from xrgs.mixture.saved_variant import freeze
@@ -75,6 +79,20 @@ def test_the_split_is_where_other_programs_look_for_it(tmp_path: Path) -> None:
     assert (out / "test_list.txt").read_text() == test
     assert (out / "sparse/0/test.txt").read_text() == test
     assert set((train + test).split()) == {file.name for file in (out / "images").iterdir()}
+
+
+def test_an_export_that_is_stopped_leaves_nothing_in_the_way_of_the_next(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, out = masked_variant(tmp_path).folder, tmp_path / "out"
+    full = OSError(errno.ENOSPC, "No space left on device", "transform.json")
+    for stop, error in ((full, XrgsError), (KeyboardInterrupt(), KeyboardInterrupt)):
+        with monkeypatch.context() as patch:
+            patch.setattr("xrgs.store.export.transform", Mock(side_effect=stop))
+            with pytest.raises(error):
+                export(folder, "colmap", out)
+        assert not out.exists()
+    export(folder, "colmap", out)
 
 
 def test_gaussians_that_no_render_shows_are_left_out() -> None:

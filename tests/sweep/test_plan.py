@@ -183,6 +183,10 @@ def test_a_label_whose_cells_have_the_config_of_the_baseline_is_named(
     assert unchanged([base, same, other]) == [
         "idle changes nothing here: its cells are those of baseline"
     ]
+    again = replace(other, spec=CellSpec("more+other", "", (), ("z=1",)))
+    assert unchanged([base, other, again]) == [
+        "more+other changes nothing here: its cells are those of other"
+    ]
     # A key of a component that is off is in no cell's id.
     components = base.conf.components
     consistency = replace(components.consistency, l1=0.5)

@@ -75,6 +75,8 @@ def run(settings: Settings) -> str:
         raise XrgsError(message)
     if settings.save is not None:
         return _save(settings.save, settings)
+    if settings.cell is not None or settings.view is not None:
+        raise XrgsError("--cell and --view are for --save FILE.npz, whose file --load measures")
     counts = sorted({1, settings.threads or usable_cores()})
     sizes = SMOKE if settings.smoke else FULL
     load = None if settings.load is None else loads.read(settings.load)

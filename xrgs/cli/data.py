@@ -87,7 +87,7 @@ def lpips(
 
 
 def inspect(
-    variant: Positional[Annotated[str, arg(metavar="FOLDER|CELL|KEY=VALUE")]],
+    variant: Positional[Annotated[str, shown_as("FOLDER|CELL|KEY=VALUE")]] = "",
     overrides: Positional[Annotated[tuple[str, ...], shown_as("KEY=VALUE ...")]] = (),
     out: Annotated[Path | None, shown_as("FILE.png")] = None,
     store: OptionalFolder = None,
@@ -104,6 +104,8 @@ def inspect(
     """
     from xrgs.store.inspect import describe
 
+    if not variant:
+        raise XrgsError("inspect: give a folder of photographs, a variant, a cell, or overrides")
     if out is not None and out.suffix.lower() != ".png":  # before the cameras are looked for
         raise XrgsError(f"out={out}: the sheet is a PNG; name a file FILE.png")
     stores = (f"store={store}",) if store else ()
@@ -138,7 +140,7 @@ def _variant(words: Sequence[str]) -> Path:
 
 
 def export(
-    name: Positional[Annotated[str, arg(metavar="CELL|VARIANT|FILE")]],
+    name: Positional[Annotated[str, shown_as("CELL|VARIANT|FILE")]] = "",
     layout: Annotated[
         Literal["auto", "colmap", "nerfstudio", "ply", "glb", "spz"], arg(name="format")
     ] = "auto",
@@ -157,6 +159,8 @@ def export(
             variant or file.
         store: The store.
     """
+    if not name:
+        raise XrgsError("export: give a cell, a variant, or a file of Gaussians")
     path = user_path(name)
     is_other_path = path.name != name and not path.is_dir()
     if path.suffix.lower()[1:] not in SPLAT_FORMATS and not is_other_path:

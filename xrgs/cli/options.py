@@ -32,6 +32,7 @@ import xrgs
 from xrgs.config import known_keys
 from xrgs.errors import XrgsError
 from xrgs.runtime.machine import end_quickly
+from xrgs.runtime.signals import exit_on_signal
 from xrgs.runtime.streams import guard_streams, say
 from xrgs.safeio.paths import user_path
 from xrgs.safeio.sanitize import for_line
@@ -125,6 +126,7 @@ def run(
     description: str | None = None,
     default: str = "",
     overrides: str = "",
+    hint: str = "Run the same command again.",
 ) -> None:
     """Parse the command line, and call the function of the command or subcommand.
 
@@ -136,9 +138,11 @@ def run(
         default: The subcommand if the command line names none.
         overrides: The subcommand that takes Hydra's overrides, `KEY=VALUE`; `command` itself if
             there are no subcommands.
+        hint: Printed if a signal ends the command: what is kept, and how to go on.
 
     Raises:
-        SystemExit: With code 1 on an `XrgsError`, and with code 2 on wrong usage.
+        SystemExit: With code 1 on an `XrgsError`, with code 2 on wrong usage, and with 128 plus its
+            number on a signal.
     """
     guard_streams()
     end_quickly()
@@ -153,7 +157,7 @@ def run(
     words = _with_options(sys.argv[1:], assignment, names)
     if takes_overrides:
         words = _with_overrides_last(words)
-    with errors_as_messages(command, assignment):
+    with exit_on_signal(hint), errors_as_messages(command, assignment):
         if callable(target):
             tyro.cli(
                 _unwrapped(target), prog=command, args=words, config=_CONFIG, registry=_REGISTRY

@@ -10,7 +10,6 @@ from tyro.conf import Positional, arg
 
 from xrgs.cli import options
 from xrgs.cli.options import STORE, Cells, Folder, shown_as
-from xrgs.runtime.signals import exit_on_signal
 from xrgs.runtime.streams import say
 from xrgs.store.store import Store
 
@@ -55,10 +54,13 @@ def render(
     from xrgs.viewer.film import make_film
     from xrgs.viewer.models import load_models
 
-    with exit_on_signal("An incomplete film is removed; PNG frames are kept."):
-        models = load_models(cells, Store(store), _CHOICES[antialiased])
-        line = make_film(models, out, path=path, views=views, size=size, fps=fps)
-    say(line)
+    models = load_models(cells, Store(store), _CHOICES[antialiased])
+    say(make_film(models, out, path=path, views=views, size=size, fps=fps))
 
 
-main = partial(options.run, "xrgs-render", render)
+main = partial(
+    options.run,
+    "xrgs-render",
+    render,
+    hint="An incomplete film is removed; PNG frames are kept.",
+)

@@ -13,7 +13,6 @@ from tyro.conf import Positional, arg
 from xrgs.cli import options
 from xrgs.cli.options import STORE, Cells, Flag, Folder, Names, shown_as
 from xrgs.errors import XrgsError
-from xrgs.runtime.signals import exit_on_signal
 from xrgs.runtime.streams import say
 from xrgs.safeio.sanitize import counted
 from xrgs.splat.settings import outside_limits
@@ -131,7 +130,7 @@ def list_cells(cells: Filter, sort: Literal["name", "age", "size"] = "name") -> 
     say(status.list_cells(cells.chosen()[1], sort))
 
 
-def show(cell: Positional[Annotated[str, arg(metavar="CELL")]], store: Folder = STORE) -> None:
+def show(cell: Positional[Annotated[str, shown_as("CELL")]] = "", store: Folder = STORE) -> None:
     """Show a cell: how its config differs from its baseline, scores, files, provenance, sweeps.
 
     Args:
@@ -140,6 +139,8 @@ def show(cell: Positional[Annotated[str, arg(metavar="CELL")]], store: Folder = 
     """
     from xrgs.sweep.status import show as described
 
+    if not cell:
+        raise XrgsError("show: give a cell")
     _, (chosen,) = Filter((cell,), store=store).chosen()
     say(described(Store(store), chosen))
 
@@ -204,7 +205,8 @@ def pack(cells: Filter, out: Annotated[Path, arg(metavar="FILE.tar.xz")]) -> Non
 
 
 def import_(
-    source: Positional[Annotated[Path, arg(metavar="ARCHIVE|FOLDER")]], store: Folder = STORE
+    source: Positional[Annotated[Path | None, shown_as("ARCHIVE|FOLDER")]] = None,
+    store: Folder = STORE,
 ) -> None:
     """Copy the store of somebody else into this one, after every file is checked.
 
@@ -217,6 +219,8 @@ def import_(
     """
     from xrgs.store import archive
 
+    if source is None:
+        raise XrgsError("import: give an archive, or the folder of a store")
     imported = archive.import_store(source, Store(store))
     say(f"{source}: imported: {imported}; already there: {imported.present}")
     _say_left(imported.left_out)
@@ -315,5 +319,5 @@ def main() -> None:
         "rescore": rescore,
         "check": check,
     }
-    with exit_on_signal("What was not removed yet is unchanged."):
-        options.run("xrgs-store", functions, description)
+    hint = "What was not removed yet is unchanged."
+    options.run("xrgs-store", functions, description, hint=hint)

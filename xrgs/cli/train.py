@@ -28,7 +28,6 @@ from xrgs.config import Conf
 from xrgs.errors import StoreError, XrgsError
 from xrgs.photos import scenes
 from xrgs.runtime.machine import usable_cores
-from xrgs.runtime.signals import exit_on_signal
 from xrgs.runtime.streams import say
 from xrgs.runtime.text import format_duration
 from xrgs.safeio.sanitize import counted, for_line
@@ -68,7 +67,7 @@ _TRAINING, _OF_THE_REST, _ENDING_S = 0.6, 0.95, 15.0
 class Settings:
     """The options of `xrgs-train`."""
 
-    photographs: Positional[Annotated[str, arg(metavar="FOLDER|VIDEO")]]
+    photographs: Positional[Annotated[str, shown_as("FOLDER|VIDEO")]] = ""
     """Folder of photographs of one place (FOLDER/** with all folders below), or a video."""
     overrides: Positional[Annotated[tuple[str, ...], shown_as("KEY=VALUE ...")]] = ()
     """Keys of xrgs-sweep, such as train.steps=5000 or seed=1; they replace the chosen values."""
@@ -138,6 +137,8 @@ def train(settings: Settings) -> None:
         settings: The options.
     """
     begin = time.monotonic()
+    if not settings.photographs:
+        raise XrgsError("give a folder of photographs, or a video")
     if settings.minutes is not None and (settings.quality != "normal" or not settings.minutes > 0):
         raise XrgsError(f"minutes={settings.minutes:g}: must be above 0, and without --quality")
     if settings.out is not None:
@@ -148,26 +149,25 @@ def train(settings: Settings) -> None:
     if settings.minutes and settings.size is None:
         side = size_for(60 * settings.minutes, _measured_unit(words.compose()))
         words.own.append(f"variant.long_side={side}")
-    with exit_on_signal("Run the same command again to continue."):
-        placed = _place(words)
-        if placed is None:
-            return
-        words.own += _recipe(settings.recipe or placed.mixture.recipe)
-        trial = None
-        if settings.minutes:
-            trial = _trial(placed, words.compose())
-            left_s = 60 * settings.minutes - (time.monotonic() - begin) - trial.start_s
-            _choose_steps(words, settings, trial.step_s, left_s)
-        steps = words.compose().train.steps
-        if steps < _LONG_RUN:
-            words.own.append(f"splat.densify.every={_REFINED_EVERY * NOMINAL_STEPS // steps}")
-        conf = words.compose()
-        recipe = words.value("ablation") or BASELINE
-        description = f"{recipe}: {conf.train.steps:,} steps at {conf.variant.long_side} px"
-        if _cell(placed, conf).state(verify=False).name == "done":
-            _say(f"trained already by {description}")
-        else:
-            _say(f"training by {description}, {format_duration(_expected_s(placed, conf, trial))}")
+    placed = _place(words)
+    if placed is None:
+        return
+    words.own += _recipe(settings.recipe or placed.mixture.recipe)
+    trial = None
+    if settings.minutes:
+        trial = _trial(placed, words.compose())
+        left_s = 60 * settings.minutes - (time.monotonic() - begin) - trial.start_s
+        _choose_steps(words, settings, trial.step_s, left_s)
+    steps = words.compose().train.steps
+    if steps < _LONG_RUN:
+        words.own.append(f"splat.densify.every={_REFINED_EVERY * NOMINAL_STEPS // steps}")
+    conf = words.compose()
+    recipe = words.value("ablation") or BASELINE
+    description = f"{recipe}: {conf.train.steps:,} steps at {conf.variant.long_side} px"
+    if _cell(placed, conf).state(verify=False).name == "done":
+        _say(f"trained already by {description}")
+    else:
+        _say(f"training by {description}, {format_duration(_expected_s(placed, conf, trial))}")
     again = "the command above continues" if settings.minutes else "run it again to continue"
     hint = f"What is done is kept: {again}."
     sweep.run("xrgs-train", [*words.all, "hydra.sweeper.brief=true"], hint)
@@ -353,4 +353,10 @@ def _say(line: str) -> None:
     say(for_line(line))
 
 
-main = partial(options.run, "xrgs-train", train, overrides="xrgs-train")
+main = partial(
+    options.run,
+    "xrgs-train",
+    train,
+    overrides="xrgs-train",
+    hint="Run the same command again to continue.",
+)

@@ -11,7 +11,7 @@ from tyro.conf import Positional
 from xrgs.cli import options
 from xrgs.cli.options import STORE, Cells, Folder
 from xrgs.errors import XrgsError
-from xrgs.runtime.signals import StopSignal, exit_on_signal
+from xrgs.runtime.signals import StopSignal
 from xrgs.runtime.streams import say
 from xrgs.safeio.sanitize import for_line
 from xrgs.store.store import Store
@@ -37,16 +37,15 @@ def view(
     from xrgs.viewer.live import NOT_ANTIALIASED, count_text, shown
     from xrgs.viewer.models import load_models
 
-    with exit_on_signal("Nothing was changed."):
-        models = load_models(cells, Store(store))
-        with shown(models, port, limit) as address:
-            for model in models:
-                say(for_line(f"{model.name}: {count_text(model, limit)}"))
-                if model.settings.antialiased:
-                    say(for_line(f"{model.name}: {NOT_ANTIALIASED}"))
-            say(f"Open {address} in a browser; Ctrl-C ends.")
-            with suppress(StopSignal):
-                threading.Event().wait()
+    models = load_models(cells, Store(store))
+    with shown(models, port, limit) as address:
+        for model in models:
+            say(for_line(f"{model.name}: {count_text(model, limit)}"))
+            if model.settings.antialiased:
+                say(for_line(f"{model.name}: {NOT_ANTIALIASED}"))
+        say(f"Open {address} in a browser; Ctrl-C ends.")
+        with suppress(StopSignal):
+            threading.Event().wait()
 
 
 main = partial(options.run, "xrgs-view", view)

@@ -7,6 +7,7 @@ camera. Gaussians of a cell that no render shows are left out.
 
 from __future__ import annotations
 
+import shutil
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -66,8 +67,11 @@ def export(path: Path, layout: str, out: Path) -> str:
             # Not a copy: cells of older versions have no tag of antialiased Gaussians.
             antialiased = cell.config().splat.raster.antialiased
             save_ply(out / _SPLATS, _shown(cell), antialiased=antialiased)
-    except OSError as error:
-        raise XrgsError(f"out={out}: {error.filename}: {error.strerror}") from error
+    except BaseException as error:
+        shutil.rmtree(out, ignore_errors=True)  # or the same command would find it not empty
+        if isinstance(error, OSError):
+            raise XrgsError(f"out={out}: {error.filename}: {error.strerror}") from error
+        raise
     splats = "" if cell is None else f", {_SPLATS}"
     counts = f"{len(data.train)} training and {len(data.test)} test views"
     return f"{counts}, {len(data.points)} points{splats}: written to {out}"

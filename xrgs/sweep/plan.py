@@ -310,20 +310,19 @@ def expected_use(plan: Sequence[PlannedCell], past: int) -> str:
 def unchanged(plan: Sequence[PlannedCell]) -> list[str]:
     """Return a line for each label, and each condition, whose cells are those of another one.
 
-    A label is compared with the baseline, and a condition with those before it.
+    A label is compared with those before it, of which the baseline is the first, and a condition
+    with those before it.
     """
-    bases = {cell.spec.shared: cell for cell in plan if cell.spec.label == BASELINE}
-    differs: dict[str, bool] = {}
+    labels: dict[str, dict[tuple[str, ...], Any]] = {}
     for cell in plan:
-        if cell.spec.label != BASELINE and (base := bases.get(cell.spec.shared)) is not None:
-            # The config of a cell that waits for a count is not complete.
-            same = not cell.waits and _deciding_values(cell) == _deciding_values(base)
-            differs[cell.spec.label] = differs.get(cell.spec.label, False) or not same
-    lines = [
-        f"{label} changes nothing here: its cells are those of {BASELINE}"
-        for label, any_differs in differs.items()
-        if not any_differs
-    ]
+        # The config of a cell that waits for a count is not complete: it is like no other.
+        values = object() if cell.waits else _deciding_values(cell)
+        labels.setdefault(cell.spec.label, {})[cell.spec.shared] = values
+    lines = []
+    for place, (label, runs) in enumerate(labels.items()):
+        same = (other for other in list(labels)[:place] if labels[other].items() >= runs.items())
+        if (before := next(same, None)) is not None:
+            lines.append(f"{label} changes nothing here: its cells are those of {before}")
     by_condition: dict[str, dict[tuple[str, str, int, int], str | None]] = {}
     for cell in plan:
         conf = cell.conf
