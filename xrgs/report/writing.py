@@ -78,7 +78,7 @@ def number(value: float, unit: str) -> str:
     if not unit and _LARGE <= abs(value) < math.inf:
         scale, prefix = next(p for p in _PREFIXES if abs(value) >= 0.9995 * p[0])
         return f"{value / scale:#.3g} {prefix}".replace(". ", " ")
-    if math.isinf(value) or abs(value) >= (10 if unit in {"", "s"} else 1000):
+    if math.isinf(value) or abs(value) >= {"s": 10, "": 100}.get(unit, 1000):
         text = f"{value:,.0f}"
     elif unit:
         text = f"{value:.2f}"
