@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib import style
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from xrgs.report.figures import png
 from xrgs.report.inference import difference, half_width, log_ratio
 from xrgs.report.markup import to_markdown
 from xrgs.report.writing import interval, signed
@@ -125,7 +125,7 @@ def write(folder: Path, page: Path | None, against: str) -> None:
     write_text(folder / "table.md", f"{text}\n")
     picture = folder / "race.png"
     with atomic_writer(picture) as stream, style.context("default"):
-        FigureCanvasAgg(figure(runs)).print_png(stream, metadata={"Software": "xrgs"})
+        stream.write(png(figure(runs)))
     if page is not None:
         content = page.read_text(encoding="utf-8")
         shown = f"![Quality over minutes]({os.path.relpath(picture, page.parent)})\n\n{text}\n"

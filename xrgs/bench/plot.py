@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -11,14 +10,13 @@ import numpy as np
 import pandas as pd
 from matplotlib import style
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from xrgs.bench.rendering import ALL_LOADS, TORCH_FLOAT64, total_ms
 from xrgs.bench.timing import Row
 from xrgs.bench.training import STEP_PARTS
-from xrgs.photos.images import SOFTWARE
+from xrgs.report.figures import png
 
 _DPI = 150
 _SIZE = (4.6, 4.2)  # of a panel, inches
@@ -33,10 +31,7 @@ def draw(results: Mapping[str, Any]) -> bytes:
     Returns:
         The bytes of a PNG.
     """
-    stream = io.BytesIO()
-    # Not savefig, which gives the same bytes and draws twice: the first time only for the layout.
-    FigureCanvasAgg(draw_figure(results)).print_png(stream, metadata={"Software": SOFTWARE})
-    return stream.getvalue()
+    return png(draw_figure(results))
 
 
 def draw_figure(results: Mapping[str, Any]) -> Figure:

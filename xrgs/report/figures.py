@@ -121,7 +121,7 @@ def side_by_side(
         _show(lower, panel.image[rows, columns], "nearest")
         for spine in lower.spines.values():
             spine.set(edgecolor=_FRAME, linewidth=1.5)
-    return _png(figure)
+    return png(figure)
 
 
 @_default_style()
@@ -147,7 +147,7 @@ def curves(
     names = [for_line(label, _MAX_NAME) for label, _ in runs]
     legend = axes[0].legend(lines, names, frameon=False, fontsize=9)
     legend.set_in_layout(False)  # a long name lies over the curves, and takes none of their room
-    return _png(figure)
+    return png(figure)
 
 
 @_default_style()
@@ -176,7 +176,7 @@ def quality_curves(
     panels[-1][1].xaxis.set_major_formatter(EngFormatter(sep=" "))
     names = [for_line(label, _MAX_NAME) for label in lines]
     figure.legend(lines.values(), names, loc="outside right center", frameon=False, fontsize=9)
-    return _png(figure)
+    return png(figure)
 
 
 def _quality_panel(
@@ -241,7 +241,7 @@ def trade_off(
         for at, (label, n) in enumerate(means["scenes"].items())
     )
     panels[-1].annotate(names, (1.04, 1), xycoords="axes fraction", va="top", fontsize=8)
-    return _png(figure)
+    return png(figure)
 
 
 def _dots(axis: Axes, means: pd.DataFrame, scenes: pd.DataFrame, quality: str) -> None:
@@ -306,7 +306,7 @@ def dependence(title: str, key: str, changes: pd.DataFrame, axes: Sequence[Metri
     if len(series) > 1:
         names = [for_line(name, _MAX_NAME) for name in series]
         figure.legend(lines, names, loc="outside lower center", frameon=False, fontsize=9, ncols=4)
-    return _png(figure)
+    return png(figure)
 
 
 def _dependence_line(axis: Axes, rows: pd.DataFrame, look: tuple[str, str]) -> Line2D:
@@ -338,7 +338,8 @@ def _show(axes: Axes, image: Image, interpolation: str) -> None:
     axes.set(xticks=[], yticks=[])
 
 
-def _png(figure: Figure) -> bytes:
+def png(figure: Figure) -> bytes:
+    """Return a figure as a PNG at its own resolution; equal figures give equal bytes."""
     stream = io.BytesIO()
     # Not savefig, which gives the same bytes and draws twice: the first time only for the layout.
     FigureCanvasAgg(figure).print_png(stream, metadata={"Software": SOFTWARE})

@@ -310,8 +310,7 @@ def expected_use(plan: Sequence[PlannedCell], past: int) -> str:
 def unchanged(plan: Sequence[PlannedCell]) -> list[str]:
     """Return a line for each label, and each condition, whose cells are those of another one.
 
-    A label is compared with those before it, of which the baseline is the first, and a condition
-    with those before it.
+    Each is compared with those before it; the baseline is the first label.
     """
     labels: dict[str, dict[tuple[str, ...], Any]] = {}
     for cell in plan:
