@@ -39,6 +39,7 @@ from xrgs.safeio.atomic import write_json, write_text
 from xrgs.safeio.records import table_text
 from xrgs.splat.backend import resolve_backend
 from xrgs.splat.settings import NOMINAL_STEPS
+from xrgs.store.cell_folder import SPLATS
 from xrgs.store.provenance import this_processor
 from xrgs.store.results import cell_metrics
 from xrgs.store.store import BASELINE, Store
@@ -192,7 +193,7 @@ class Race:
             "steps": steps,
             "seconds": metrics["training_time_s"],
             "gaussians": int(metrics["gaussians"]),
-            "bytes": cell.status().files["splats.ply"].bytes,
+            "bytes": cell.status().files[SPLATS].bytes,
             "cell": cell.id,
             **{name: metrics.get(name, math.nan) for name in race_table.SCORES},
         }

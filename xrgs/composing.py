@@ -193,8 +193,8 @@ _FORMER_GROUPS = {
     "noise_weighting": ("floor", 1.0),
     "skip_backward": ("share", 1.0),
 }
-#: Ablations that were part of xrgs, and are now in the package `examples/arms`.
-ARMS = frozenset({*_FORMER_GROUPS, "mip_off_late", "near_gradients"})
+#: All ablations of the package `examples/arms`.
+ARMS = frozenset({*_FORMER_GROUPS, "mip_off_late", "near_gradients", "unweighted_consistency"})
 
 
 def from_dict(values: Any) -> Conf:

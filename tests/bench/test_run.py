@@ -132,7 +132,7 @@ def test_results_that_cant_be_written_are_refused_before_any_measurement(
     [
         (["--save=a.npz"], "--save FILE.npz needs --cell FOLDER and --view NAME"),
         (["--cell=a", "--view=b"], "--cell and --view are for --save FILE.npz"),
-        (["--save=a.npz", "--cell=nowhere", "--view=a"], "--cell nowhere: is absent"),
+        (["--save=a.npz", "--cell=nowhere", "--view=a"], "nowhere: the cell is absent, not done"),
         (["--repeats=0"], "--repeats 0: must be at least 1"),
         (["--threads=-1"], "--threads -1: must be at least 0"),
         (["--seed", "-1"], "--seed -1: must be at least 0"),

@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 import xrgs
 import xrgs.store.inspect
 from xrgs.mixture import poses, variant
+from xrgs.safeio.atomic import write_json
 from xrgs.store.cell_folder import CellFolder
 from xrgs.sweep import job
 
@@ -73,6 +74,7 @@ def test_inspect_takes_a_folder_of_photographs_as_they_are(
     code, out, err = xrgs_data("inspect", *words)
     assert code == 0, err
     assert out.endswith("s/variants/k-1 None\n")
+    assert (tmp_path / "s/variants").is_dir()  # for the child that builds
     (conf,) = built
     assert (conf["scene"]["path"], conf["variant"]["long_side"]) == ("garden", 99)
     assert (conf["variant"]["tags"], conf["variant"]["factor"]) == ("distance", 1)
@@ -89,6 +91,22 @@ def test_inspect_takes_a_folder_of_photographs_as_they_are(
     for word in ("store=~/s", "--store=~/s"):
         _, _, err = xrgs_data("inspect", "graden", word)
         assert err == "xrgs-data: graden: there is no such folder, and no store /home/me/s"
+
+
+def test_inspect_makes_images_again_of_a_trimmed_variant_and_tries_a_failed_scene_again(
+    xrgs_data: XrgsData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, built: list[Any]
+) -> None:
+    monkeypatch.setattr(variant, "key", lambda *_: "k")
+    failed, trimmed = (tmp_path / "s" / "variants" / name for name in ("failed-k", "trimmed-k-1"))
+    failed.mkdir(parents=True)
+    write_json(failed / "report.json", {"scene": "motorcycle", "reason": "no first pair"})
+    words = ("inspect", "scene=motorcycle", "store=s")
+    assert (xrgs_data(*words)[0], len(built)) == (0, 1)
+    trimmed.mkdir()
+    requests: list[dict[str, Any]] = []
+    monkeypatch.setattr(job, "run_in_child", lambda _, request, *__: requests.append(request))
+    assert xrgs_data(*words)[:2] == (0, "s/variants/k-1 None\n")
+    assert [request.get("variant") for request in requests] == ["k-1"]
 
 
 @pytest.mark.slow

@@ -202,7 +202,9 @@ def test_an_axis_of_the_sweepers_own_settings_and_a_glob_are_planned(
     assert (code, "plan: 4 cells" in err, "/ near_limit /" in err) == (0, True, True)
 
 
-def test_an_arm_that_was_moved_out_is_named_with_its_package(sweep_here: RunCommand) -> None:
+def test_an_arm_of_the_package_of_arms_is_named_with_it(sweep_here: RunCommand) -> None:
+    files = Path(__file__).parents[2].glob("examples/arms/conf/ablation/*.yaml")
+    assert {file.stem for file in files} == ARMS
     arm = min(ARMS)
     code, _, err = sweep_here(f"+ablation=[keep_large,{arm}]", "dry_run=true")
     assert code == 1

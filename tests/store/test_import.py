@@ -142,7 +142,7 @@ def test_cells_with_other_files_are_left_out(foreign: Store, mine: Store) -> Non
     scores.symlink_to(elsewhere)
     left_out("scores.csv", "not a regular file")
     scores.unlink()
-    left_out("scores.csv", "No such file")
+    left_out("scores.csv is missing")
     elsewhere.rename(scores)
     splats.rename(elsewhere)
     os.mkfifo(splats)
@@ -168,7 +168,7 @@ BILLION = b"[" + b"[[]]," * 700_000 + b"[]]"
 @pytest.mark.parametrize(
     ("file", "content", "why"),
     [
-        ("status.json", b'{"state": "failed", "reason": "x"}', "the cell has failed"),
+        ("status.json", b'{"state": "failed", "reason": "x"}', "the cell is failed, not done: x"),
         ("status.json", b"[" * 1_000_000, "not valid JSON|Expected `object`"),
         ("status.json", b'{"state": "done", "files": {"../x": {"bytes": 1}}}', "key in files"),
         ("status.json", b'{"state": "done"}', r"config\.json is not listed"),

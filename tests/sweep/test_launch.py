@@ -302,19 +302,6 @@ def test_a_job_finds_its_folders_wherever_it_runs(
     assert conf.store == "s"  # the plan's own config is not changed
 
 
-def test_a_lease_that_the_plan_has_watched_long_enough_is_free_for_the_job(
-    compose: Callable[..., config.Conf], store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A job in a process of its own has watched nothing."""
-    cell = planned(replace(compose(), threads=5), "a")
-    held = lease.acquire(store.leases, str(cell.cell_id))
-    assert held is not None
-    monkeypatch.setattr(lease.Owner, "lives", False)
-    study._hand_over(cell, 3, store)
-    assert not lease.names(store.leases)
-    assert store.cell(str(cell.cell_id)).config().threads == 5  # as the user has set them
-
-
 @pytest.mark.parametrize("how", ["done", "training"])
 def test_a_cell_that_another_sweep_has_begun_since_the_plan_is_left_as_it_is(
     compose: Callable[..., config.Conf], store: Store, how: str

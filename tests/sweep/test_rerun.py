@@ -16,7 +16,6 @@ from PIL import Image
 
 from xrgs.config import Conf
 from xrgs.errors import XrgsError
-from xrgs.formats.ply import ANTIALIASED_LINE
 from xrgs.safeio.atomic import write_json
 from xrgs.store import provenance
 from xrgs.store.attempts import begin_attempt, plan_cell
@@ -251,16 +250,6 @@ def test_a_file_that_can_not_be_read_now_is_named(
     with pytest.raises(XrgsError, match=os.strerror(errno.EIO)) as caught:
         rerun(cell.path)
     assert f"{cell.id}/{name}" in str(caught.value)
-
-
-def test_a_tag_of_antialiased_gaussians_is_no_other_number(
-    cell: CellFolder, train: Callable[..., None]
-) -> None:
-    """Cells of 0.1.0 have none."""
-    train(("splats.ply", "ply", f"ply{ANTIALIASED_LINE.decode()}"))
-    assert rerun(cell.path).differences == []
-    train(("splats.ply", "ply", f"plx{ANTIALIASED_LINE.decode()}"))
-    assert rerun(cell.path).differences == ["splats.ply: the bytes differ"]
 
 
 def test_names_of_a_foreign_cell_are_not_obeyed(

@@ -80,7 +80,7 @@ def test_a_word_for_several_cells_names_them(store: Store) -> None:
     [
         ("ab", "ab: several cells have such an id or scene: abc1, abd2, abd3"),
         ("../abc1", "../abc1: no cells have such an id"),
-        ("abd3", "abd3: it is failed and not done: out of memory"),
+        ("abd3", "{cells}/abd3: the cell is failed, not done: out of memory"),
     ],
 )
 def test_a_word_that_names_no_finished_cell_is_refused(
@@ -88,7 +88,7 @@ def test_a_word_that_names_no_finished_cell_is_refused(
 ) -> None:
     with pytest.raises(StoreError) as caught:
         models.find_cell(word, store)
-    assert str(caught.value).startswith(message)
+    assert str(caught.value).startswith(message.format(cells=store.cells_folder))
     assert models.find_cell("abc", store).id == "abc1"
 
 

@@ -195,9 +195,7 @@ def load_from_cell(folder: Path, view_name: str) -> Load:
     from xrgs.store.cell_folder import CellFolder
 
     cell = CellFolder(folder)
-    state = cell.state()
-    if state.name != "done":
-        raise XrgsError(f"--cell {folder}: is {state.name} {state.reason}".rstrip())
+    cell.check_done()
     data = cell.dataset()
     views = {view.name: view for view in (*data.train, *data.test)}
     if view_name not in views:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -13,6 +12,7 @@ from xrgs.errors import XrgsError
 from xrgs.runtime.machine import usable_cores
 from xrgs.runtime.progress import progress
 from xrgs.safeio.atomic import atomic_writer, write_json
+from xrgs.safeio.files import check_writable
 from xrgs.safeio.records import table_text
 from xrgs.safeio.sanitize import for_csv
 from xrgs.splat.backend import resolve_backend
@@ -168,11 +168,7 @@ def _check_writable(settings: Settings) -> None:
     with _writing():
         for file in files:
             file.parent.mkdir(parents=True, exist_ok=True)
-            try:
-                tempfile.TemporaryFile(dir=file.parent).close()
-            except OSError as error:
-                error.filename = str(file)  # the name of the temporary file is random
-                raise
+            check_writable(file.parent)
 
 
 def _write(files: Mapping[str, bytes], results: dict[str, Any], settings: Settings) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 from xrgs.bench.against import HR_SHARE, SIDES
 from xrgs.bench.rendering import STAGES
 from xrgs.bench.timing import Row
+from xrgs.runtime.text import padded
 
 # Columns of each table: heading -> format string for the values of a row.
 _SIZES = {"threads": "{threads}", "Gaussians": "{gaussians}", "size": "{width}x{height}"}
@@ -130,12 +131,9 @@ def describe(sizes: Row) -> str:
 
 def table(rows: Sequence[Row], columns: Mapping[str, str]) -> str:
     """Align columns of text, the first to the left and the others to the right."""
-    lines = [list(columns), *([_cell(form, row) for form in columns.values()] for row in rows)]
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    return "\n".join(
-        "  ".join([line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])]).rstrip()
-        for line in lines
-    )
+    cells = [tuple(columns), *(tuple(_cell(of, row) for of in columns.values()) for row in rows)]
+    lines, _ = padded(cells, f"l{'r' * (len(columns) - 1)}")
+    return "\n".join("  ".join(line).rstrip() for line in lines)
 
 
 def _cell(form: str, row: Row) -> str:

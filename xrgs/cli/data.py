@@ -116,7 +116,7 @@ def _variant(words: Sequence[str]) -> Path:
     """Return the folder of the variant that `inspect` shows; build the variant if it is missing."""
     from xrgs import composing
     from xrgs.cli.overrides import check_no_axis, explained, with_quotes
-    from xrgs.sweep import build_variants
+    from xrgs.sweep import build_variants, job
 
     first, *others = words
     path = user_path(first.removesuffix(ALL_BELOW))
@@ -135,8 +135,14 @@ def _variant(words: Sequence[str]) -> Path:
         words = with_quotes(words)
         check_no_axis(words)
         conf = composing.compose(*words)
-        store = Store(Path(conf.store))
-        return store.variants / build_variants.find_or_build(conf, store)
+    conf.retry = "failed"
+    store = Store(Path(conf.store))
+    (planned,) = build_variants.plan([conf], store, allow_build=True)
+    if planned.id is None:
+        hint = build_variants.how_to_get([conf.scene])
+        raise XrgsError("; ".join(filter(None, (planned.error, hint))))
+    job.restore_images(conf, store, planned.id)
+    return store.variants / planned.id
 
 
 def export(

@@ -214,8 +214,6 @@ def _place(words: _Words) -> _Placed | None:
     check_plugins([conf], imported=conf.dry_run)
     if conf.dry_run:
         store.check_room()
-    else:
-        store.prepare()
     (planned,) = build_variants.plan([conf], store, allow_build=not conf.dry_run)
     if planned.error:
         raise XrgsError(planned.error)

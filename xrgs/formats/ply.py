@@ -38,7 +38,7 @@ Table = NDArray[np.float32]
 _log = logging.getLogger(__name__)
 
 _NORMALS = ("nx", "ny", "nz")
-ANTIALIASED_LINE = b"comment SplatRenderMode: mip\n"
+_ANTIALIASED_LINE = b"comment SplatRenderMode: mip\n"
 """Header line for antialiased Gaussians, as of Brush and SuperSplat's converter."""
 #: Comments for antialiased Gaussians, in lower case: `SplatRenderMode: mip`, or Postshot's
 #: `antialiased 1`.
@@ -93,7 +93,7 @@ def save_ply(
     ]
     with atomic_writer(path, durable=durable) as file:
         file.write(b"ply\nformat binary_little_endian 1.0\n")
-        file.write(ANTIALIASED_LINE if antialiased else b"")
+        file.write(_ANTIALIASED_LINE if antialiased else b"")
         file.write("".join(f"{line}\n" for line in header).encode())
         file.write(table.numpy().astype("<f4", copy=False).data)
 

@@ -26,7 +26,7 @@ from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.evaluation.metrics import METRICS, ON_REQUEST, VIEW_METRICS
 from xrgs.runtime.progress import progress
 from xrgs.safeio.sanitize import for_file_name, for_line
-from xrgs.store.cell_folder import CellFolder, CellState, number_columns
+from xrgs.store.cell_folder import HISTORY, CellFolder, CellState, number_columns
 from xrgs.store.inspect import SfmReport
 from xrgs.store.provenance import machine
 from xrgs.store.results import over_views
@@ -179,7 +179,7 @@ def _read_done(cell: CellFolder) -> DoneCell:
         provenance=cell.provenance(),
         config=config,
         scores=scores,
-        totals=_totals(number_columns(cell.path / "history.csv")),
+        totals=_totals(number_columns(cell.path / HISTORY)),
         curve=_curve(cell.path / "quality.csv", summary, scores),
     )
 

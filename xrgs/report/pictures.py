@@ -33,6 +33,7 @@ from xrgs.report.markup import titled
 from xrgs.runtime.progress import progress
 from xrgs.safeio.atomic import atomic_writer
 from xrgs.safeio.sanitize import for_file_name
+from xrgs.store.cell_folder import HISTORY
 from xrgs.store.trimming import check_images
 
 _Drawing = Callable[[Path], "Picture"]  # draws into the file
@@ -47,7 +48,7 @@ _SENSITIVITY_TITLE = (
 )
 _CURVES = {"gaussians": "Gaussians", "loss": "loss of the step's view, as each run weighs it"}
 #: The most pixels of an image: a figure needs three in memory, at 12 bytes a pixel.
-_MAX_PIXELS = 1 << 24
+MAX_PIXELS = 1 << 24
 #: The most pictures that are drawn unless they are named; each takes up to a second.
 _MAX_PICTURES = 40
 #: A setting needs at least this many values for a figure over it.
@@ -328,12 +329,12 @@ def _training(store: ReportStore, pair: pd.Series, base: str, file: Path) -> Pic
         try:
             runs.append((name, store.cell(pair[key]).history()[["step", *_CURVES]]))
         except (StoreError, KeyError):
-            return Picture(title, None, f"cells/{pair[key]}/history.csv can't be read")
+            return Picture(title, None, f"cells/{pair[key]}/{HISTORY} can't be read")
     return _drawn(title, partial(curves, title, runs, _CURVES), file)
 
 
 def _image(store: ReportStore, file: Path) -> NDArray[np.float32]:
     try:
-        return images.read_png(file, max_pixels=_MAX_PIXELS)
+        return images.read_png(file, max_pixels=MAX_PIXELS)
     except (UnreadableError, ImageError) as error:
         raise ReportError(f"{store.without_paths(str(file))} can't be read") from error

@@ -11,6 +11,7 @@ import os
 import re
 import shutil
 import stat
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -106,6 +107,23 @@ def read_bytes(path: Path, max_bytes: int = MAX_BYTES) -> bytes:
             return stream.read(status.st_size)  # `max_bytes` would allocate all of it
     finally:
         os.close(descriptor)
+
+
+def check_writable(folder: Path, count: int = 0) -> None:
+    """Check that a file of `count` bytes can be written in a folder, and leave nothing behind.
+
+    Of a folder that does not exist, the nearest one above that does is tried: the OSError has its
+    path as `filename`.
+    """
+    folder = folder.absolute()
+    while not folder.exists() and not folder.is_symlink():
+        folder = folder.parent
+    try:
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.write(bytes(count))
+    except OSError as error:
+        error.filename = str(folder)  # the file's own name is random
+        raise
 
 
 def remove_path(path: Path) -> None:

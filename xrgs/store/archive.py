@@ -37,7 +37,15 @@ from xrgs.safeio.hashing import digest
 from xrgs.safeio.records import errors_named, read_file, read_struct, read_table
 from xrgs.safeio.sanitize import counted, for_line
 from xrgs.store import trimming
-from xrgs.store.cell_folder import CONFIG, NOT_RESULTS, STATUS, CellFolder, CellState
+from xrgs.store.cell_folder import (
+    CONFIG,
+    HISTORY,
+    IDENTITY,
+    NOT_RESULTS,
+    STATUS,
+    CellFolder,
+    CellState,
+)
 from xrgs.store.identity import cell_id
 from xrgs.store.schema import FileEntry, RecordedCell
 from xrgs.store.store import Store, unchanged_record
@@ -212,7 +220,7 @@ _PASSED_OVER = re.compile(r"\..*|failed-.*|.*\.aside-.*")
 #: Files of a cell or a variant that are not copied.
 _NOT_COPIED = (NOT_RESULTS - {STATUS}) | {saved_variant.LOG}
 #: Files that every done cell has.
-_REQUIRED = ("config.json", "identity.json", "provenance.json", "summary.json", "scores.csv")
+_REQUIRED = (CONFIG, IDENTITY, "provenance.json", "summary.json", "scores.csv")
 
 
 def import_store(source: Path, store: Store) -> Copied:
@@ -359,15 +367,12 @@ class _Import:
 def _check_cell(folder: Path) -> None:
     """Raise `XrgsError` where a cell is not done, is damaged, or its id does not fit its files."""
     cell = CellFolder(folder)
-    status = cell.status()
-    if status.state != "done":
-        raise StoreError(f"the cell has {status.state}")
-    if missing := set(_REQUIRED) - status.files.keys():
+    cell.check_done(verify=False)
+    listed_files = cell.status().files.keys()
+    if missing := set(_REQUIRED) - listed_files:
         raise StoreError(f"status.json: files: {min(missing)} is not listed")
     _check_damage(cell.verify())
-    state = cell.state()
-    if state.name != "done":
-        raise StoreError(state.reason)
+    cell.check_done()
     if cell_id(cell.identity()) != cell.id:
         raise StoreError(
             "identity.json: its digest is not the id of the cell: the file has changed, or the cell"
@@ -375,7 +380,7 @@ def _check_cell(folder: Path) -> None:
         )
     if cell.config().seed != cell.identity().seed:
         raise StoreError("config.json: seed: not the seed of identity.json")
-    for name in {"history.csv", "quality.csv"} & status.files.keys():
+    for name in {HISTORY, "quality.csv"} & listed_files:
         read_table(folder / name)
 
 

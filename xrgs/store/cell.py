@@ -30,7 +30,7 @@ from xrgs.safeio.sanitize import for_terminal
 from xrgs.splat.backend import resolve_backend
 from xrgs.splat.gaussians import Gaussians
 from xrgs.store import provenance
-from xrgs.store.cell_folder import CellFolder
+from xrgs.store.cell_folder import HISTORY, SPLATS, CellFolder
 from xrgs.store.schema import Summary
 from xrgs.store.scoring import scoring_code
 from xrgs.training import dataset
@@ -138,7 +138,7 @@ def write_curves(
     """Write the record of a training: `history.csv`, and `quality.csv` if it was evaluated."""
     if scores:
         write_text(folder.path / "quality.csv", table_text(scores), durable=False)
-    write_text(folder.path / "history.csv", table_text(history), durable=False)
+    write_text(folder.path / HISTORY, table_text(history), durable=False)
 
 
 def run_cell(
@@ -194,7 +194,7 @@ def _train_and_score(
         _log.info("%s", line)
     peak_rss_bytes = peak_rss()  # read before evaluation, which may load the network of LPIPS
     save_ply(
-        folder.path / "splats.ply",
+        folder.path / SPLATS,
         trained.gaussians,
         antialiased=conf.splat.raster.antialiased,
         durable=False,

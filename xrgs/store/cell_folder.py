@@ -33,12 +33,12 @@ if TYPE_CHECKING:
     from xrgs.splat.gaussians import Gaussians
     from xrgs.training.dataset import Dataset
 
+CONFIG, IDENTITY, CHECKPOINT, LOG = "config.json", "identity.json", "checkpoint.npz", "log.txt"
+HISTORY, SPLATS, STATUS = "history.csv", "splats.ply", "status.json"
 #: Reports are made from these files, so they are verified by their hash; others by their size.
 _VERIFIED_BY_HASH = frozenset(
-    {"config.json", "identity.json", "scores.csv", "summary.json", "history.csv", "quality.csv"}
+    {CONFIG, IDENTITY, "scores.csv", "summary.json", HISTORY, "quality.csv"}
 )
-CONFIG, IDENTITY, CHECKPOINT, LOG = "config.json", "identity.json", "checkpoint.npz", "log.txt"
-STATUS = "status.json"
 #: Files in the folder of a done cell that its status does not list.
 NOT_RESULTS = frozenset({LOG, STATUS, "progress.json", CHECKPOINT, f"refused-{CHECKPOINT}"})
 
@@ -111,6 +111,13 @@ class CellFolder:
         now = progress.read(self.progress)
         return CellState("running", f"by {owner}" + (f": {now}" if now else ""))
 
+    def check_done(self, *, verify: bool = True) -> None:
+        """Raise `StoreError` where the cell is not done, with its `state` and the reason."""
+        state = self.state(verify=verify)
+        if state.name != "done":
+            why = f": {state.reason}" if state.reason else ""
+            raise StoreError(f"{self.path}: the cell is {state.name}, not done{why}")
+
     def _state(self, *, verify: bool) -> CellState:
         try:
             try:
@@ -145,7 +152,7 @@ class CellFolder:
         if not self.checkpoint.exists():
             return 0
         try:
-            header, rows = read_table(self.path / "history.csv")
+            header, rows = read_table(self.path / HISTORY)
             return int(dict(zip(header, rows[-1], strict=True))["step"]) + 1
         except (StoreError, LookupError, ValueError):
             return 0
@@ -356,7 +363,7 @@ class CellFolder:
         """Return the training history, one row per logged step; only `view` is text."""
         import pandas as pd
 
-        file = self.path / "history.csv"
+        file = self.path / HISTORY
         header, rows = read_table(file)
         table = pd.DataFrame(rows, columns=header, dtype=object)
         try:
@@ -373,8 +380,8 @@ class CellFolder:
         """Load the trained Gaussians, in the world of `cameras`."""
         from xrgs.formats.ply import read_ply
 
-        self.check_not_trimmed("splats.ply")
-        return read_ply(self.path / "splats.ply").gaussians
+        self.check_not_trimmed(SPLATS)
+        return read_ply(self.path / SPLATS).gaussians
 
     def variant(self) -> Variant:
         """Load the variant that the cell was trained on, from the store that the cell is in."""
@@ -425,4 +432,4 @@ def number_columns(file: Path) -> dict[str, list[float]]:
 
 def _is_heavy(name: str) -> bool:
     """Return whether a file of a done cell is needed only by pictures, viewers and `rerun=`."""
-    return name == "splats.ply" or name.startswith("renders/")
+    return name == SPLATS or name.startswith("renders/")

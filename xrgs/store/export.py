@@ -8,7 +8,6 @@ camera. Gaussians of a cell that no render shows are left out.
 from __future__ import annotations
 
 import shutil
-import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,17 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from xrgs.errors import XrgsError
+from xrgs.mixture.saved_variant import MANIFEST
 from xrgs.mixture.views import Variant
 from xrgs.safeio.atomic import write_json, write_text
-from xrgs.safeio.files import list_names
-from xrgs.store.cell_folder import CellFolder
+from xrgs.safeio.files import check_writable, list_names
+from xrgs.store.cell_folder import IDENTITY, SPLATS, CellFolder
 
 if TYPE_CHECKING:
     from xrgs.mixture.colmap import PinholeImage
     from xrgs.splat.gaussians import Gaussians
     from xrgs.training.dataset import Dataset, LoadedView
 
-_SPLATS = "splats.ply"
 #: Formats of a file that has only the Gaussians; each is also the file's suffix.
 SPLAT_FORMATS = ("ply", "glb", "spz")
 
@@ -66,13 +65,13 @@ def export(path: Path, layout: str, out: Path) -> str:
         if cell is not None:
             # Not a copy: cells of older versions have no tag of antialiased Gaussians.
             antialiased = cell.config().splat.raster.antialiased
-            save_ply(out / _SPLATS, _shown(cell), antialiased=antialiased)
+            save_ply(out / SPLATS, _shown(cell), antialiased=antialiased)
     except BaseException as error:
         shutil.rmtree(out, ignore_errors=True)  # or the same command would find it not empty
         if isinstance(error, OSError):
             raise XrgsError(f"out={out}: {error.filename}: {error.strerror}") from error
         raise
-    splats = "" if cell is None else f", {_SPLATS}"
+    splats = "" if cell is None else f", {SPLATS}"
     counts = f"{len(data.train)} training and {len(data.test)} test views"
     return f"{counts}, {len(data.points)} points{splats}: written to {out}"
 
@@ -127,13 +126,12 @@ def check_place(out: Path, form: str) -> None:
     elif out.exists() and not out.is_dir():
         raise XrgsError(f"out={out}: is a file; name a new folder")
     # A training of hours may come before the export.
-    folder = (out.parent if form in SPLAT_FORMATS else out).absolute()
-    while not folder.exists() and not folder.is_symlink():
-        folder = folder.parent
     try:
-        tempfile.TemporaryFile(dir=folder).close()
+        check_writable(out.parent if form in SPLAT_FORMATS else out)
     except OSError as error:
-        raise XrgsError(f"out={out}: can't be written: {folder}: {error.strerror}") from error
+        raise XrgsError(
+            f"out={out}: can't be written: {error.filename}: {error.strerror}"
+        ) from error
 
 
 def without_invisible(gaussians: Gaussians, alpha_min: float) -> Gaussians:
@@ -169,14 +167,12 @@ def _cell(folder: Path) -> CellFolder | None:
         raise XrgsError(
             f"{folder}: {error.strerror}; give the folder of a cell or a variant"
         ) from error
-    if "variant.json" in names:
+    if MANIFEST in names:
         return None
-    if "identity.json" not in names:
+    if IDENTITY not in names:
         raise XrgsError(f"{folder}: neither a cell nor a variant")
     cell = CellFolder(folder.absolute())
-    state = cell.state()
-    if state.name != "done":
-        raise XrgsError(f"{folder}: this cell is {state.name}, not done ({state.reason})")
+    cell.check_done()
     return cell
 
 

@@ -27,6 +27,7 @@ from xrgs.runtime.text import TextTable, listed, to_text
 from xrgs.safeio.atomic import atomic_writer
 from xrgs.safeio.records import read_struct
 from xrgs.safeio.sanitize import MAX_CELL, for_line
+from xrgs.splat.normalize import camera_positions
 
 #: Two views count as taken by one camera where the angle between them, in degrees, and the
 #: distance, as a share of the cameras' extent, are at most these. SfM placed the copies of two sets
@@ -146,8 +147,7 @@ def shared_cameras(manifest: Manifest) -> list[str]:
     splits = {"train", "test"} if manifest.held_out else {"train"}
     views = [view for view in manifest.views if view.split in splits]
     world_to_camera = np.array([view.viewmat for view in views])
-    rotations, shifts = world_to_camera[:, :3, :3], world_to_camera[:, :3, 3]
-    centres = -np.einsum("nji,nj->ni", rotations, shifts)
+    rotations, centres = world_to_camera[:, :3, :3], camera_positions(world_to_camera)
     extent = np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()
     distances = np.linalg.norm(centres[:, None] - centres, axis=2)
     cosines = (np.einsum("nij,mij->nm", rotations, rotations) - 1) / 2

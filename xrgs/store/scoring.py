@@ -19,13 +19,12 @@ from xrgs.safeio.hashing import file_digest
 from xrgs.safeio.records import table_text
 from xrgs.safeio.refactorings import canonical
 from xrgs.safeio.sanitize import counted, for_line
-from xrgs.store.cell_folder import CellFolder
+from xrgs.store.cell_folder import SPLATS, CellFolder
 from xrgs.store.identity import changed_code
 from xrgs.store.store import Store
 
 #: The key of the protocol among the digests of scores.
 PROTOCOL = "protocol"
-_SPLATS = "splats.ply"
 #: The file of each score's function, relative to the package.
 _FILES = {
     metric.name: f"{metric.score.__module__.removeprefix('xrgs.').replace('.', '/')}.py"
@@ -130,9 +129,9 @@ def _score(cell: CellFolder, also: frozenset[str]) -> None:
             f"it was trained with other code ({', '.join(parts)}), which may render its Gaussians"
             " otherwise: train it again"
         )
-    cell.check_not_trimmed(_SPLATS)
-    if file_digest(cell.path / _SPLATS) != cell.status().files[_SPLATS].sha256:
-        raise StoreError(f"{_SPLATS} has changed since the cell finished")
+    cell.check_not_trimmed(SPLATS)
+    if file_digest(cell.path / SPLATS) != cell.status().files[SPLATS].sha256:
+        raise StoreError(f"{SPLATS} has changed since the cell finished")
     views, settings = cell.dataset().test, cell.config().splat
     requested = also | on_request(cell.status().scored_by)
     with also_scored(requested):

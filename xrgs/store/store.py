@@ -8,7 +8,6 @@ described in `xrgs.store.cell_folder`.
 from __future__ import annotations
 
 import stat
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,7 +21,7 @@ from xrgs.photos.scenes.scene import scene_name
 from xrgs.runtime import lease
 from xrgs.runtime.progress import log_line
 from xrgs.safeio.atomic import write_json
-from xrgs.safeio.files import is_name, is_transient, sync_name
+from xrgs.safeio.files import check_writable, is_name, is_transient, sync_name
 from xrgs.safeio.hashing import digest
 from xrgs.safeio.paths import user_path
 from xrgs.safeio.records import list_folder, read_struct
@@ -67,7 +66,7 @@ class Store:
         self.path = Path(path)
         """The folder."""
         self.scenes = self.path / "scenes"
-        """Folder of the rendered photographs of procedural scenes."""
+        """Folder of the rendered photographs of procedural scenes, and of the frames of videos."""
         self.variants = self.path / "variants"
         """Folder of the frozen variants."""
         self.cells_folder = self.path / "cells"
@@ -133,14 +132,9 @@ class Store:
 
     def check_room(self) -> None:
         """Check that the disk has room, and leave nothing behind; the folder need not exist yet."""
-        folder = self.path.absolute()
-        while not folder.exists() and not folder.is_symlink():
-            folder = folder.parent
         try:
-            with tempfile.TemporaryFile(dir=folder) as file:
-                file.write(bytes(_MIN_FREE_BYTES))
+            check_writable(self.path, _MIN_FREE_BYTES)
         except OSError as error:
-            error.filename = str(folder)  # the file's own name is random
             raise self._unwritable(error) from error
 
     def _unwritable(self, error: OSError) -> StoreError:
@@ -246,7 +240,7 @@ class Store:
         if (folder := user_path(word) / IDENTITY).is_file():
             return CellFolder(folder.parent.absolute())
         self.check_exists()
-        return self.cell(self._full_id(word, [cell.id for cell in self.cell_folders()], "cells"))
+        return self.cell(self.full_id(_name_of(word), [cell.id for cell in self.cell_folders()]))
 
     def find_folder(self, word: str) -> Path:
         """Return the folder of the cell or the variant that a word names, see `find_cell`."""
@@ -256,7 +250,7 @@ class Store:
         variants = filter(variant_folders.is_variant, list_folder(self.variants))
         folders = {name: self.variant(name) for name in variants}
         folders |= {cell.id: cell.path for cell in self.cell_folders()}
-        return folders[self._full_id(word, list(folders), "cells or variants")]
+        return folders[self.full_id(_name_of(word), list(folders), "cells or variants")]
 
     def find_sweep(self, word: str) -> str:
         """Return the id of the sweep that a word names, see `find_cell`.
@@ -269,15 +263,14 @@ class Store:
         latest = {ids[-1]: name} if ids else {}
         return listing.full_id(name, self.sweep_ids(), "sweeps", latest)
 
-    def _full_id(self, word: str, ids: Sequence[str], kinds: str) -> str:
-        """Return the one id that a word names."""
-        name = _name_of(word)
+    def full_id(self, word: str, ids: Sequence[str], kinds: str = "cells") -> str:
+        """Return the one of `ids` that a word names: itself, its beginning, or its scene."""
         done = {
             cell_id: row.label
             for cell_id, row in self.cell_names().items()
-            if row.scene == name and self.cell(cell_id).state(verify=False).name == "done"
+            if row.scene == word and self.cell(cell_id).state(verify=False).name == "done"
         }
-        return listing.full_id(name, ids, kinds, done)
+        return listing.full_id(word, ids, kinds, done)
 
     def cell_folders(self) -> list[CellFolder]:
         """Return the cells, sorted by id, without folders of earlier attempts (`<id>.aside-1`).

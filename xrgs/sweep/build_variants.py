@@ -117,17 +117,6 @@ def _root_near(missing: Path) -> str:
     return shlex.quote(str(roots[0])) if roots else ""
 
 
-def find_or_build(conf: Conf, store: Store) -> str:
-    """Return the id of the frozen variant of a config; `build` it if the store lacks it."""
-    if hint := how_to_get([conf.scene]):
-        raise XrgsError(f"scene.path={conf.scene.path}: no such folder; {hint}")
-    frozen = variant.find(store.variants, variant.key(conf.scene, conf.variant))
-    if frozen is not None:
-        return frozen.id
-    store.prepare()
-    return build(conf, store)
-
-
 def plan(confs: Sequence[Conf], store: Store, *, allow_build: bool) -> list[PlannedVariant]:
     """Return the variants of configs for a sweep, or the reasons why there are none.
 
@@ -137,7 +126,8 @@ def plan(confs: Sequence[Conf], store: Store, *, allow_build: bool) -> list[Plan
     """
     stored = [_outcome(_stored_variant, conf, store) for conf in confs]
     lacking = {i: confs[i] for i, planned in enumerate(stored) if planned is None}
-    if allow_build:
+    if allow_build and lacking:
+        store.prepare()
         new = _build_all(lacking, len(confs), store)
     else:  # not before a build, which leaves out files that have a header and can't be decoded
         new = {i: _outcome(_expected_variant, conf, store) for i, conf in lacking.items()}

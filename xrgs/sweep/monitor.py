@@ -32,7 +32,7 @@ from xrgs.sweep.plan import PlannedCell
 _POLL_S = 1.0
 #: The pause after a snapshot is at least this many times as long as the snapshot took, so that a
 #: slow store is not kept busy.
-_PAUSE_FACTOR = 20
+PAUSE_FACTOR = 20
 #: The speed of a cell is judged from this share of its training on: before, it has few Gaussians.
 _JUDGED = 0.25
 #: A log gets a line when a cell has ended, and at the latest this many seconds after the last line.
@@ -336,7 +336,7 @@ class SweepMonitor:
                 start = time.monotonic()
                 with suppress(OSError):  # the store is out of reach for now
                     self._show(self.snapshot())
-                pause = max(_POLL_S, _PAUSE_FACTOR * (time.monotonic() - start))
+                pause = max(_POLL_S, PAUSE_FACTOR * (time.monotonic() - start))
 
     def _show(self, snapshot: SweepSnapshot) -> None:
         if is_terminal(sys.stderr):

@@ -7,7 +7,6 @@ numbers.
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -27,7 +26,7 @@ from xrgs.safeio.sanitize import for_line
 from xrgs.splat.backend import resolve_backend
 from xrgs.store import provenance
 from xrgs.store.attempts import begin_attempt, free_name, plan_cell
-from xrgs.store.cell_folder import CellFolder
+from xrgs.store.cell_folder import CONFIG, HISTORY, IDENTITY, SPLATS, STATUS, CellFolder
 from xrgs.store.identity import cell_identity
 from xrgs.store.schema import Identity
 from xrgs.store.store import Store
@@ -38,7 +37,7 @@ from xrgs.sweep.monitor import SweepMonitor
 from xrgs.sweep.plan import PlannedCell
 
 #: Files of results that are compared byte for byte.
-_RESULTS = ("scores.csv", "history.csv", "splats.ply")
+_RESULTS = ("scores.csv", HISTORY, SPLATS)
 #: Figures of the summary that are compared; times and memory differ from run to run.
 _COUNTS = ("steps", "gaussians", "evaluations", "grow_grad2d")
 #: Entries of the provenance that are not compared, or are compared otherwise.
@@ -120,14 +119,14 @@ def _read(original: CellFolder) -> tuple[Conf, dict[str, Any]]:
     """Return the config of a finished cell, and the keys that are newer than it."""
     if not original.path.is_dir():
         raise XrgsError(f"rerun={original.path}: there is no such folder")
-    for name in ("config.json", "identity.json", "provenance.json", "status.json"):
+    for name in (CONFIG, IDENTITY, "provenance.json", STATUS):
         if not (original.path / name).is_file():
             raise XrgsError(f"rerun={original.path} is not a finished cell: it has no {name}")
     state = original.state()
     if state.name == "failed":
         reason = state.reason.partition("\n")[0]
         raise XrgsError(f"rerun={original.path}: the cell failed and has no results ({reason})")
-    return composing.from_file(original.path / "config.json")
+    return composing.from_file(original.path / CONFIG)
 
 
 def _check_plugins_allowed(original: CellFolder, conf: Conf, allowed: Sequence[str]) -> None:
@@ -240,20 +239,8 @@ def _differences(original: CellFolder, repeated: CellFolder) -> Iterator[str]:
             yield f"{name}: missing in {original.path}"
             continue
         then = trimmed[name].sha256 if name in trimmed else file_digest(original.path / name)
-        if then not in _digests(repeated.path / name):
+        if then != file_digest(repeated.path / name):
             yield f"{name}: the bytes differ"
-
-
-def _digests(file: Path) -> Iterator[str]:
-    """Yield the digests of files with the same numbers as this one.
-
-    Cells of 0.1.0 have no comment that says that their Gaussians are antialiased.
-    """
-    yield file_digest(file)
-    if file.suffix == ".ply":
-        from xrgs.formats.ply import ANTIALIASED_LINE
-
-        yield hashlib.sha256(file.read_bytes().replace(ANTIALIASED_LINE, b"", 1)).hexdigest()
 
 
 def _score_differences(original: CellFolder, repeated: CellFolder) -> Iterator[str]:

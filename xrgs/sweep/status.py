@@ -28,6 +28,7 @@ from xrgs.safeio.sanitize import MAX_CELL, counted, for_file_name, for_line
 from xrgs.store.cell_folder import CellFolder
 from xrgs.store.listing import STATES, CellRow, SweepRow, latest_records
 from xrgs.store.store import DEFAULT_STORE, Store
+from xrgs.sweep.monitor import PAUSE_FACTOR
 from xrgs.sweep.plan import PlannedCell
 
 _T = TypeVar("_T")
@@ -38,9 +39,6 @@ _MAX_NAMED = 20
 _MAX_DONE, _ID = 12, 8
 #: Least seconds between two looks of `watch` on a terminal, and seconds between two in a log.
 _WATCH_S, _LOG_S = 2.0, 60.0
-#: The pause after a look is at least this many times as long as the look took, so that a slow store
-#: is not kept busy.
-_PAUSE_FACTOR = 20
 #: Entries of a cell's provenance that are shown; the others are in `provenance.json`.
 _PROVENANCE = (
     *("started", "xrgs", "git", "git_diff_sha256", "backend", "threads", "cpu", "platform"),
@@ -162,7 +160,7 @@ def watch(path: Path) -> None:
             text = running(store)
             if is_terminal(sys.stdout):
                 drawn = redraw(text, drawn, sys.stdout)
-                pause = max(_WATCH_S, _PAUSE_FACTOR * (time.monotonic() - start))
+                pause = max(_WATCH_S, PAUSE_FACTOR * (time.monotonic() - start))
             else:
                 say(text)
                 pause = _LOG_S

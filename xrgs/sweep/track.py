@@ -31,7 +31,7 @@ from xrgs.runtime.progress import log_line
 from xrgs.safeio.atomic import write_json, write_text
 from xrgs.safeio.records import read_struct, read_table
 from xrgs.safeio.sanitize import for_csv, for_file_name, for_line
-from xrgs.store.cell_folder import CellFolder, number_columns
+from xrgs.store.cell_folder import HISTORY, STATUS, CellFolder, number_columns
 from xrgs.store.listing import modified
 from xrgs.store.store import Store
 from xrgs.sweep.plan import PlannedCell
@@ -297,7 +297,7 @@ def curves(cell: CellFolder, *, done: bool) -> Curves:
         StoreError: A file can't be read; the message names it.
         ValueError: A value is not a number.
     """
-    history = _table(cell.path / "history.csv", "history")
+    history = _table(cell.path / HISTORY, "history")
     rows = [*history]
     if (quality := cell.path / "quality.csv").is_file():
         rows += _table(quality, "quality")
@@ -366,7 +366,7 @@ class _Followed:
             Exception: Whatever a package, a server or a disk raises. The next call asks the
                 tracker for its last step, and goes on from there.
         """
-        names = () if self.ended else ("history.csv", "status.json")
+        names = () if self.ended else (HISTORY, STATUS)
         written = tuple(when for name in names if (when := modified(self.cell.path / name)))
         if not written or written == self._seen:
             return

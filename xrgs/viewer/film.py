@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from xrgs.errors import XrgsError
-from xrgs.photos.images import write_png
+from xrgs.photos.images import to_8_bit, write_png
 from xrgs.runtime.progress import progress
 from xrgs.safeio.atomic import atomic_writer
 from xrgs.safeio.files import list_names
@@ -133,7 +133,7 @@ def _frames(models: Sequence[Model], cameras: Sequence[Camera]) -> Iterator[Fram
 @torch.no_grad()
 def _panel(model: Model, camera: Camera) -> Frame:
     image = rasterize(model.gaussians, camera, settings=model.settings).image
-    return np.asarray(image.clamp(0, 1).mul(255).round().to(torch.uint8).numpy())
+    return to_8_bit(image.numpy())
 
 
 def _labelled(panel: Frame, name: str) -> Frame:

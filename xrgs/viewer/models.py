@@ -90,9 +90,7 @@ def find_cell(word: str, store: Store) -> CellFolder:
         StoreError: There is no such store or cell, there are several, or it is not finished.
     """
     cell = store.find_cell(word)
-    state = cell.state(verify=False)
-    if state.name != "done":
-        raise StoreError(f"{cell.id}: it is {state.name} and not done: {state.reason}")
+    cell.check_done(verify=False)
     return cell
 
 

@@ -18,7 +18,7 @@ from xrgs.report.context import Context
 from xrgs.report.markup import titled
 from xrgs.report.writing import by_key, number, verdict, with_unit
 from xrgs.safeio.sanitize import MAX_CELL, counted, for_line
-from xrgs.store.cell_folder import number_columns
+from xrgs.store.cell_folder import HISTORY, number_columns
 
 #: The keys of a run. The page shows the cells of a run, one for each label, side by side.
 RUN = ["scene", "condition", "variant_seed", "seed"]
@@ -123,7 +123,7 @@ def add_history(content: Content, store: ReportStore, comparison: Comparison) ->
     for rows in runs(comparison):
         for _, row in rows[~rows["cell_id"].isin(store.external)].iterrows():
             try:
-                history = number_columns(store.cell(row["cell_id"]).path / "history.csv")
+                history = number_columns(store.cell(row["cell_id"]).path / HISTORY)
             except StoreError as error:
                 label = f"{shown(row['scene'])}, {shown(row['label'])}"
                 content.notes.append(f"{label}: no history, {why(error, store)}")

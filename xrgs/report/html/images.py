@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 from matplotlib import colormaps
-from numpy.typing import NDArray
 from PIL import Image
 
 from xrgs.errors import StoreError, UnreadableError, XrgsError
@@ -28,6 +27,7 @@ from xrgs.photos.images import ImageError
 from xrgs.report.collect import ReportStore
 from xrgs.report.compare import Comparison
 from xrgs.report.html.content import Content, finite, run_names, runs, shown, why
+from xrgs.report.pictures import MAX_PIXELS
 from xrgs.runtime.progress import progress
 
 if TYPE_CHECKING:
@@ -42,9 +42,6 @@ _ERROR_SHRINK = 2
 #: Quality of WebP, and the most bytes that a pixel of a photograph takes with it; best first.
 _QUALITIES = ((90, 0.40), (80, 0.22), (60, 0.13), (40, 0.09))
 
-
-#: The largest image that is read, px.
-_MAX_PIXELS = 1 << 24
 #: (cell's id, view) -> scores by name.
 _Scores = dict[tuple[str, str], dict[str, float | None]]
 #: The approximate ratio of all pixels, with error maps, to those of photographs and renders.
@@ -99,11 +96,6 @@ def data_url(image: Image.Image, quality: int) -> str:
     stream = io.BytesIO()
     image.save(stream, "WEBP", quality=quality)
     return f"data:image/webp;base64,{base64.b64encode(stream.getvalue()).decode('ascii')}"
-
-
-def to_image(array: NDArray[np.float32]) -> Image.Image:
-    """Convert an array [H, W, 3] to an image; values outside 0..1 are clamped."""
-    return Image.fromarray(np.round(np.clip(array, 0, 1) * 255).astype(np.uint8))
 
 
 def error_map(photograph: Image.Image, render: Image.Image) -> Image.Image:
@@ -215,14 +207,14 @@ def _read(
     """
     renders: dict[int, Image.Image] = {}
     try:
-        truth = images.read_png_pil(_photograph(store, cells, view), max_pixels=_MAX_PIXELS)
+        truth = images.read_png_pil(_photograph(store, cells, view), max_pixels=MAX_PIXELS)
     except (UnreadableError, ImageError) as error:
         content.notes.append(f"{title}: no photograph, {why(error, store)}")
         return None
     for place, cell_id in enumerate(cells["cell_id"]):
         try:
             file = store.render(cell_id, view)
-            renders[place] = images.read_png_pil(file, truth.size, _MAX_PIXELS)
+            renders[place] = images.read_png_pil(file, truth.size, MAX_PIXELS)
         except (StoreError, ImageError) as error:
             label = shown(cells["label"].iloc[place])
             content.notes.append(f"{title}: no render of {label}, {why(error, store)}")
@@ -331,7 +323,7 @@ def _add_training_views(
     for view in scene.training_views():
         originals = [] if view.original is None else [view.original]
         shown_images = [view.photograph, *originals, *view.renders.values()]
-        places = album.add([*map(to_image, shown_images)])
+        places = album.add([Image.fromarray(images.to_8_bit(image)) for image in shown_images])
         if places is None:
             content.notes.append(
                 f"{names['scene']}: the training view {shown(view.name)} is left out, for the"
