@@ -52,13 +52,20 @@ class Filter:
             XrgsError: No cell has a name that is given, several ids have one beginning, or an
                 amount is below 0.
         """
-        from xrgs.store.listing import STATES
+        from xrgs.store.listing import STATES, full_id
 
         for message in outside_limits(self):
             raise XrgsError(message)
-        store = Store(self.store)
-        cells = store.cell_rows()
-        named = {store.full_id(word, [cell.id for cell in cells]) for word in self.ids}
+        cells = Store(self.store).cell_rows()
+        done = [cell for cell in cells if cell.state.name == "done"]
+        named = {
+            full_id(
+                word,
+                [cell.id for cell in cells],
+                done={cell.id: cell.arm for cell in done if cell.scene == word},
+            )
+            for word in self.ids
+        }
         for key, names, existing in (
             ("scenes", self.scenes, [cell.scene for cell in cells]),
             ("ablations", self.ablations, [cell.label for cell in cells]),

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 
 from xrgs.errors import StoreError, XrgsError
 from xrgs.runtime.text import listed
@@ -204,7 +205,12 @@ def size_of(path: Path) -> int | None:
         return None
 
 
-def full_id(word: str, ids: Sequence[str], kinds: str, done: Mapping[str, str]) -> str:
+def full_id(
+    word: str,
+    ids: Iterable[str],
+    kinds: str = "cells",
+    done: Mapping[str, str] = MappingProxyType({}),
+) -> str:
     """Return the id that a word names: an id, a beginning that no other id has, or a scene.
 
     A scene must have one cell in `done`, which has the labels of its done cells by their ids.
@@ -213,6 +219,7 @@ def full_id(word: str, ids: Sequence[str], kinds: str, done: Mapping[str, str]) 
     Raises:
         StoreError: The word names none, or several.
     """
+    ids = [*ids]
     if word in ids:
         return word
     matches = {full: "" for full in ids if full.startswith(word)}

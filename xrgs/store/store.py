@@ -240,7 +240,7 @@ class Store:
         if (folder := user_path(word) / IDENTITY).is_file():
             return CellFolder(folder.parent.absolute())
         self.check_exists()
-        return self.cell(self.full_id(_name_of(word), [cell.id for cell in self.cell_folders()]))
+        return self.cell(self._full_id(word, [cell.id for cell in self.cell_folders()], "cells"))
 
     def find_folder(self, word: str) -> Path:
         """Return the folder of the cell or the variant that a word names, see `find_cell`."""
@@ -250,7 +250,7 @@ class Store:
         variants = filter(variant_folders.is_variant, list_folder(self.variants))
         folders = {name: self.variant(name) for name in variants}
         folders |= {cell.id: cell.path for cell in self.cell_folders()}
-        return folders[self.full_id(_name_of(word), list(folders), "cells or variants")]
+        return folders[self._full_id(word, list(folders), "cells or variants")]
 
     def find_sweep(self, word: str) -> str:
         """Return the id of the sweep that a word names, see `find_cell`.
@@ -263,14 +263,15 @@ class Store:
         latest = {ids[-1]: name} if ids else {}
         return listing.full_id(name, self.sweep_ids(), "sweeps", latest)
 
-    def full_id(self, word: str, ids: Sequence[str], kinds: str = "cells") -> str:
-        """Return the one of `ids` that a word names: itself, its beginning, or its scene."""
+    def _full_id(self, word: str, ids: Sequence[str], kinds: str) -> str:
+        """Return the one id that a word names."""
+        name = _name_of(word)
         done = {
             cell_id: row.label
             for cell_id, row in self.cell_names().items()
-            if row.scene == word and self.cell(cell_id).state(verify=False).name == "done"
+            if row.scene == name and self.cell(cell_id).state(verify=False).name == "done"
         }
-        return listing.full_id(word, ids, kinds, done)
+        return listing.full_id(name, ids, kinds, done)
 
     def cell_folders(self) -> list[CellFolder]:
         """Return the cells, sorted by id, without folders of earlier attempts (`<id>.aside-1`).
