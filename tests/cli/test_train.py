@@ -17,7 +17,7 @@ from xrgs.bench.speed import Trial
 from xrgs.cli import sweep, train
 from xrgs.photos.scenes import motorcycle
 from xrgs.store.cell_folder import CellFolder
-from xrgs.store.inspect import ALIKE_RECIPE, MIXTURE_RECIPE, Mixture, SfmReport
+from xrgs.store.inspect import RECIPE, SfmReport
 from xrgs.store.store import Store
 
 RunCommand = Callable[..., tuple[int, str, str]]
@@ -28,11 +28,11 @@ ACCENT = "e\N{COMBINING ACUTE ACCENT}"
 def handed_over(
     call_command: RunCommand, monkeypatch: pytest.MonkeyPatch
 ) -> Callable[..., dict[str, str]]:
-    """(mixture, *arguments) -> the overrides that a sweep gets, once the photographs are placed."""
+    """The overrides that a sweep gets for some arguments, once the photographs are placed."""
 
-    def run(mixture: Mixture, *arguments: str) -> dict[str, str]:
+    def run(*arguments: str) -> dict[str, str]:
         words: list[str] = []
-        found = train._Placed("0123-4567", mixture, SfmReport())
+        found = train._Placed("0123-4567", SfmReport())
         monkeypatch.setattr(train, "_place", lambda _: found)
         monkeypatch.setattr(composing, "compose", composed_by_hydra)
         monkeypatch.setattr(train, "_measured_unit", lambda _: 1e-7)
@@ -56,18 +56,17 @@ def garden(photographs: Callable[..., Path], tmp_path: Path) -> Path:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("garden")
-def test_the_recipe_is_for_what_the_photographs_are(
+def test_the_default_is_the_recipe_on_the_photographs_as_they_are(
     handed_over: Callable[..., dict[str, str]],
 ) -> None:
-    mixed = handed_over(Mixture(coarse=3, views=8), "garden")
-    expected = {"ablation": MIXTURE_RECIPE, "scene.path": "garden", "baseline": "false"}
+    chosen = handed_over("garden")
+    expected = {"ablation": RECIPE, "scene.path": "garden", "baseline": "false"}
     expected |= {"preset": "laptop", "splat.densify.every": "500"}  # as preset=laptop has it
     expected |= {"variant": "sampling_rate", "variant.factor": "1"}  # as they are
-    assert expected.items() <= mixed.items()
-    assert handed_over(Mixture(coarse=1, views=8), "garden")["ablation"] == ALIKE_RECIPE
-    words = handed_over(Mixture(0, 8), "garden", "--recipe", "baseline")
+    assert expected.items() <= chosen.items()
+    words = handed_over("garden", "--recipe", "baseline")
     assert not {"ablation", "baseline"} & words.keys(), "gsplat's own training"
-    words = handed_over(Mixture(0, 8), "garden", "--quality", "high")
+    words = handed_over("garden", "--quality", "high")
     assert {"preset": "paper", "train.evaluate_every": "0"}.items() <= words.items()
     assert "splat.densify.every" not in words, "a long run is refined as the paper's"
 
@@ -92,7 +91,7 @@ def test_the_recipe_is_for_what_the_photographs_are(
 def test_options_are_overrides_and_those_of_the_user_win(
     handed_over: Callable[..., dict[str, str]], arguments: list[str], expected: dict[str, str]
 ) -> None:
-    words = handed_over(Mixture(0, 8), "garden", *arguments)
+    words = handed_over("garden", *arguments)
     assert expected.items() <= words.items()
 
 
@@ -111,7 +110,7 @@ def test_the_command_that_minutes_prints_makes_the_same_cell(
 ) -> None:
     said: list[str] = []
     monkeypatch.setattr(train, "_say", said.append)
-    chosen = handed_over(Mixture(3, 8), "garden", "--minutes", minutes, *more)
+    chosen = handed_over("garden", "--minutes", minutes, *more)
     if minutes == "10":  # a step takes 10 ms; 600 s are for more than the most steps
         assert (chosen["train.steps"], chosen["preset"]) == ("30000", "paper")
     else:
@@ -121,7 +120,7 @@ def test_the_command_that_minutes_prints_makes_the_same_cell(
     again = shlex.split(line.partition(": ")[2])
     assert again[:2] == ["xrgs-train", "garden"]
     assert "--minutes" not in again
-    assert handed_over(Mixture(3, 8), *again[1:]) == chosen
+    assert handed_over(*again[1:]) == chosen
 
 
 @pytest.mark.slow
@@ -129,7 +128,7 @@ def test_the_command_that_minutes_prints_makes_the_same_cell(
 def test_the_user_may_replace_what_minutes_choose(
     handed_over: Callable[..., dict[str, str]],
 ) -> None:
-    fixed = handed_over(Mixture(0, 8), "garden", "--minutes", "10", "train.steps=5", "--size", "99")
+    fixed = handed_over("garden", "--minutes", "10", "train.steps=5", "--size", "99")
     assert (fixed["train.steps"], fixed["variant.long_side"]) == ("5", "99")
 
 
@@ -234,7 +233,7 @@ def test_a_scene_with_odd_names_is_made_and_its_last_lines_lead_on(
     code, out, err = call_command("train", *small, "--out=a.ply")
     assert code == 0, err  # found again, and exported by its name
     assert "training" not in err + out
-    assert f"trained already by {ALIKE_RECIPE}: 8 steps at 250 px\n" in out
+    assert f"trained already by {RECIPE}: 8 steps at 250 px\n" in out
     assert out.splitlines()[-1].endswith("written to a.ply")
     export = ("export", folder.name, "--out", "b.ply", "--store", store)
     assert call_command("data", *export)[0] == 0

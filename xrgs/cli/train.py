@@ -1,7 +1,7 @@
 """`xrgs-train`: makes a scene of photographs, or of a video, without degrading them.
 
-It inspects the photographs, finds their cameras, chooses a recipe (with --minutes also size and
-steps, by this machine's measured speed), and trains one cell by the code of `xrgs-sweep`. All its
+It inspects the photographs, finds their cameras, chooses size and steps (with --minutes by this
+machine's measured speed), and trains one cell by the code of `xrgs-sweep`. All its
 choices are overrides of Hydra, which the user's own overrides replace.
 """
 
@@ -11,7 +11,7 @@ import shlex
 import time
 from collections.abc import Sequence
 from copy import deepcopy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from statistics import fmean
@@ -34,7 +34,7 @@ from xrgs.safeio.sanitize import counted, for_line
 from xrgs.splat.settings import NOMINAL_STEPS
 from xrgs.store.cell_folder import CellFolder
 from xrgs.store.export import check_place
-from xrgs.store.inspect import Mixture, SfmReport
+from xrgs.store.inspect import RECIPE, SfmReport
 from xrgs.store.store import BASELINE, Store
 
 if TYPE_CHECKING:
@@ -77,8 +77,8 @@ class Settings:
     """draft: 1,000 steps at 336 px; normal: 3,000 at 504 px; high: 30,000 at 1,008 px."""
     size: Annotated[int | None, shown_as("PX")] = None
     """Longer side of the photographs in training; 0 keeps their size."""
-    recipe: Annotated[str | None, shown_as("NAME[,NAME]")] = None
-    """Ablations of xrgs-sweep, trained together; by default chosen for the photographs."""
+    recipe: Annotated[str, shown_as("NAME[,NAME]")] = RECIPE
+    """Ablations of xrgs-sweep, trained together; `baseline` is gsplat's training."""
     hold_none: Annotated[Flag, arg(name="all")] = False
     """Train on all photographs; otherwise every eighth is held out, to measure the quality."""
     masks: OptionalFolder = None
@@ -144,15 +144,12 @@ def train(settings: Settings) -> None:
     if settings.out is not None:
         check_place(settings.out, form_of(settings.out))
     words = _words(settings)
-    if settings.recipe:  # a wrong name is found before the cameras are
-        replace(words, own=[*words.own, *_recipe(settings.recipe)]).compose()
     if settings.minutes and settings.size is None:
         side = size_for(60 * settings.minutes, _measured_unit(words.compose()))
         words.own.append(f"variant.long_side={side}")
     placed = _place(words)
     if placed is None:
         return
-    words.own += _recipe(settings.recipe or placed.mixture.recipe)
     trial = None
     if settings.minutes:
         trial = _trial(placed, words.compose())
@@ -177,6 +174,7 @@ def train(settings: Settings) -> None:
 def _words(settings: Settings) -> _Words:
     """Return the words that don't depend on the photographs."""
     words = [*as_they_are(settings.photographs), f"store={settings.store}"]
+    words += _recipe(settings.recipe)
     words += ["retry=failed", "lpips.fetch=false", *_QUALITIES[settings.quality]]
     words += [f"variant.long_side={settings.size}"] if settings.size is not None else []
     words += ["variant.test_every=0"] if settings.hold_none else []
@@ -190,7 +188,6 @@ class _Placed:
     """The result of `_place`: the variant with the found cameras."""
 
     variant_id: str
-    mixture: Mixture
     report: SfmReport
 
 
@@ -223,7 +220,7 @@ def _place(words: _Words) -> _Placed | None:
     for note in notes:
         _say(f"  {note}")
     if planned.id is None:
-        _say("without --dry-run, their cameras are found, and a recipe is chosen for them")
+        _say("without --dry-run, their cameras are found")
         return None
     report = read_report(home_of(store.variants, planned.id))
     mix = mixture(read_views(store.variants, planned.id))
@@ -232,7 +229,7 @@ def _place(words: _Words) -> _Placed | None:
         f"{name}: {'a mixture' if mix.is_one else f'{kind}s alike'}: {mix.coarse or 'none'}"
         f" of {mix.views} to train on are 1.5 times or more as coarse as the finest"
     )
-    return None if conf.dry_run else _Placed(planned.id, mix, report)
+    return None if conf.dry_run else _Placed(planned.id, report)
 
 
 def _recipe(names: str) -> list[str]:
@@ -285,7 +282,7 @@ def _choose_steps(words: _Words, settings: Settings, step_s: float, left_s: floa
     side = conf.variant.long_side
     words.own += [*_QUALITIES[quality], f"variant.long_side={side}", f"train.steps={steps}"]
     again = ["xrgs-train", settings.photographs, "--quality", quality, "--size", str(side)]
-    again += ["--recipe", settings.recipe] if settings.recipe else []
+    again += ["--recipe", settings.recipe] if settings.recipe != RECIPE else []
     again += ["--all"] if settings.hold_none else []
     again += ["--masks", str(settings.masks)] if settings.masks else []
     again += ["--store", str(settings.store)] if settings.store != STORE else []

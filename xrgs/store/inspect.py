@@ -37,8 +37,8 @@ _SAME_ANGLE, _SAME_PLACE = 0.1, 0.01
 #: The least share of coarse training views in a mixture. Our choice: `plus` gains 0.81 dB with a
 #: share of 0.45 (monstree), and no PSNR with 0.11 (reichstag).
 _MIXTURE_FROM = 0.25
-#: The recipe (a file of `conf/ablation/`) for a mixture, and the one for photographs alike.
-MIXTURE_RECIPE, ALIKE_RECIPE = "plus", "tuned_baseline"
+#: The recipe (a file of `conf/ablation/`) for photographs, alike or not: reports/alike.
+RECIPE = "plus"
 #: The beginning of the note that undegraded photographs differ too little for HR and LR classes.
 _MEANINGLESS = "the split by variant.tags="
 #: The beginnings of all notes on a split into HR and LR views.
@@ -227,11 +227,6 @@ class Mixture(NamedTuple):
     views: int
 
     @property
-    def recipe(self) -> str:
-        """The recipe for such views."""
-        return MIXTURE_RECIPE if self.is_one else ALIKE_RECIPE
-
-    @property
     def is_one(self) -> bool:
         """Whether enough views are coarse to call the photographs a mixture."""
         return self.coarse >= _MIXTURE_FROM * self.views
@@ -245,11 +240,11 @@ def mixture(views: Iterable[View | ViewEntry]) -> Mixture:
 
 
 def _mixture(frozen: Variant) -> str:
-    """Say whether the training views are a mixture, and which recipe is for it."""
+    """Say whether the training views are a mixture, and which recipes are for them."""
     counts = mixture(frozen.views)
-    recipes = f"+ablation={ALIKE_RECIPE} is for such views"
+    recipes = f"+ablation={RECIPE} is for such views too"
     if counts.is_one:
-        recipes = f"+ablation={MIXTURE_RECIPE} and +ablation=lean are for mixtures"
+        recipes = f"+ablation={RECIPE} and +ablation=lean are for mixtures"
     return (
         f"{'a mixture' if counts.is_one else 'hardly a mixture'}: {counts.coarse} of {counts.views}"
         " training views would need at least 1.5 times as many px a side to show the scene as"
