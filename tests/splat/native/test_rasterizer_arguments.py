@@ -110,7 +110,7 @@ def test_lists_beyond_memory_are_a_clear_error_and_leave_no_trace() -> None:
 
     def check() -> bool:
         used = int(Path("/proc/self/statm").read_text("utf-8").split()[0]) * resource.getpagesize()
-        resource.setrlimit(resource.RLIMIT_AS, (used + (200 << 20), resource.RLIM_INFINITY))
+        resource.setrlimit(resource.RLIMIT_AS, (used + (100 << 20), resource.RLIM_INFINITY))
         for _ in range(2):
             with pytest.raises(
                 MemoryError, match=r"the lists of 6000 visible Gaussians in 800x800"
