@@ -34,8 +34,8 @@ from xrgs.splat.normalize import camera_positions
 #: within 0.06 degrees and 0.9 %. In the scenes of the studies no other pair is within four times
 #: both limits.
 _SAME_ANGLE, _SAME_PLACE = 0.1, 0.01
-#: The least share of coarse training views in a mixture. Our choice, between monstree (0.45), whose
-#: close-ups and distant views were meant to differ, and reichstag (0.11).
+#: The least share of coarse training views in a mixture. Our choice, between monstree (0.45), a
+#: tree from close and far, and reichstag (0.11), a building by tourists (reports/captures).
 _MIXTURE_FROM = 0.25
 #: The recipe (a file of `conf/ablation/`) for photographs, alike or not: reports/alike.
 RECIPE = "plus"
