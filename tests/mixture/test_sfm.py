@@ -109,7 +109,8 @@ def test_any_number_of_threads_gives_the_same_cameras(
 ) -> None:
     """Other draws of RANSAC move a camera by 0.036% of the scene, another order of images by 0.17%.
 
-    One run of some 90 had other last digits, for a reason inside COLMAP.
+    Cameras are compared, not bits: on several threads, pairs at times lose matches
+    (`findings/pycolmap_matcher_threads.sh`), which happened in one run of some 90.
     """
     conf = compose("scene=procedural", "scene.views=5")
     rendered = scenes.resolve(conf.scene, tmp_path, 180).files.values()

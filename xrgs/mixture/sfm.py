@@ -97,9 +97,10 @@ def reconstruct(
 
     For any number of threads, images have the same ids and RANSAC the same random numbers. About 90
     runs with 1 and 3 threads on the same kind of processor gave the same bits. In one other run the
-    focal length differed by 1/100,000, for an unknown reason inside COLMAP. On a processor with
-    another size of the first-level data cache, an image that is registered by more than 168 points
-    has a pose with other last digits (`findings/pycolmap_cache_size.sh`).
+    focal length differed by 1/100,000, probably since pairs of images at times lose matches on
+    several threads (`findings/pycolmap_matcher_threads.sh`). On a processor with another size of the first-level
+    data cache, an image that is registered by more than 168 points has a pose with other last
+    digits (`findings/pycolmap_cache_size.sh`).
 
     Args:
         sfm_images: The images; those without `K` get a SIMPLE_RADIAL camera for each `camera` name.
