@@ -14,7 +14,6 @@ import pytest
 
 from xrgs.config import Conf, SceneConf, SfmConf
 from xrgs.mixture import sfm
-from xrgs.mixture.pose_error import pose_error
 from xrgs.mixture.views import Reconstruction
 from xrgs.photos import images, scenes
 from xrgs.photos.scenes import motorcycle
@@ -104,14 +103,21 @@ def test_its_points_lie_at_the_depths_of_the_published_disparity(stereo_pair: St
 
 
 @pytest.mark.slow
-def test_any_number_of_threads_gives_the_same_cameras(
+def test_any_number_of_threads_gives_the_same_bits(
     compose: Callable[..., Conf], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Other draws of RANSAC move a camera by 0.036% of the scene, another order of images by 0.17%.
+    """Other draws of RANSAC move a camera by 0.036% of the scene, another order by 0.17%.
 
-    Cameras are compared, not bits: on several threads, pairs at times lose matches
-    (`findings/pycolmap_matcher_threads.sh`), which happened in one run of some 90.
+    One thread matches: on several, pycolmap 4.2.1 loses matches in up to 7 of 44,850 pairs
+    (`findings/pycolmap_matcher_threads.sh`), too seldom for a test to see.
     """
+    match, matching = pycolmap.match_image_pairs, set()
+
+    def matched(*arguments: Any, matching_options: Any, **options: Any) -> None:
+        matching.add(matching_options.num_threads)
+        match(*arguments, matching_options=matching_options, **options)
+
+    monkeypatch.setattr(pycolmap, "match_image_pairs", matched)
     conf = compose("scene=procedural", "scene.views=5")
     rendered = scenes.resolve(conf.scene, tmp_path, 180).files.values()
     models = []
@@ -123,11 +129,13 @@ def test_any_number_of_threads_gives_the_same_cameras(
             images.save(work / file.name, images.read(file))
         inputs = [sfm.SfmImage(file.name, file.stem, "all") for file in rendered]
         models.append(sfm.reconstruct(inputs, work, work, conf.variant.sfm))
+    assert matching == {1}
     one, three = models
     assert one.report["registered"] == 5
-    first, second = ({str(i): pose for i, pose in model.viewmats.items()} for model in models)
-    assert pose_error(second, first)["position_percent_max"] < 0.01
-    assert three.lenses[0].params[0] == pytest.approx(one.lenses[0].params[0], rel=1e-4)
+    assert one.lenses == three.lenses
+    assert np.array_equal(one.points, three.points)
+    for i, pose in one.viewmats.items():
+        assert np.array_equal(pose, three.viewmats[i])
 
 
 def test_unrelated_images_give_an_empty_model(

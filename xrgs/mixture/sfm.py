@@ -95,10 +95,8 @@ def reconstruct(
 ) -> Reconstruction:
     """Find cameras and points by exhaustive matching and incremental mapping.
 
-    For any number of threads, images have the same ids and RANSAC the same random numbers. About 90
-    runs with 1 and 3 threads on the same kind of processor gave the same bits. In one other run the
-    focal length differed by 1/100,000, probably since pairs of images at times lose matches on
-    several threads (`findings/pycolmap_matcher_threads.sh`). On a processor with another size of the first-level
+    The result has the same bits for any number of threads: images have the same ids, RANSAC the
+    same random numbers, and one thread matches. On a processor with another size of the first-level
     data cache, an image that is registered by more than 168 points has a pose with other last
     digits (`findings/pycolmap_cache_size.sh`).
 
@@ -300,7 +298,8 @@ def _batches(sfm_images: Sequence[SfmImage], size: int) -> Iterator[list[SfmImag
 def _match(sfm_images: Sequence[SfmImage], database: Path, seed: int) -> None:
     """Match every pair of images: each image with all images before it."""
     matching = pycolmap.FeatureMatchingOptions()
-    matching.num_threads = usable_cores()
+    # On several threads, pairs at times lose matches (`findings/pycolmap_matcher_threads.sh`).
+    matching.num_threads = 1
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed  # of each pair, on any thread
     pairing = pycolmap.ImportedPairingOptions()
