@@ -120,6 +120,16 @@ def to_conf(cfg: DictConfig) -> Conf:
     return conf
 
 
+def following_seed(cfg: DictConfig) -> dict[str, str]:
+    """Return the texts with an interpolation of `seed`, by their keys, as `variant.seed=${seed}`."""
+    from omegaconf import OmegaConf
+
+    values = cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=False))
+    values.pop("hydra", None)
+    texts = {key: str(value) for key, value in dotted(values)}
+    return {key: text for key, text in texts.items() if "${" in text and "seed" in text}
+
+
 def dotted(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Yield the values of nested dicts with their dotted keys, as `splat.densify.every`."""
     for name, value in values.items():
