@@ -92,7 +92,6 @@ class Study:
         self._task = task
         self._config = config
         self._composed: dict[tuple[str, ...], DictConfig] = {}
-        self._confs: dict[tuple[str, ...], Conf] = {}
         self._shared: dict[tuple[str, ...], tuple[Conf, bool]] = {}
         """By the overrides without the seed: a config, and whether `variant.seed` follows `seed`"""
         self._store: Store | None = None
@@ -267,28 +266,24 @@ class Study:
         return replace(cell, spec=spec, conf=self._compose(spec))
 
     def _compose(self, spec: CellSpec) -> Conf:
-        """Return a cell's config, composed once however often it is asked for.
+        """Return a cell's config.
 
-        Cells that differ only in their seed share all other values, unless one of these is computed
-        from the seed.
+        Cells that differ only in their seed share one, unless more than `variant.seed` follows it.
         """
         overrides = tuple(spec.overrides)
-        if overrides in self._confs:
-            return self._confs[overrides]
-        seed = next((int(of[1]) for text in overrides if (of := _SEED.fullmatch(text))), None)
         others = tuple(text for text in overrides if not _SEED.fullmatch(text))
-        if seed is not None and others in self._shared:
-            conf, follows = self._shared[others]
-            variant = replace(conf.variant, seed=seed) if follows else conf.variant
-            conf = replace(conf, seed=seed, variant=variant)
-        else:
+        if others not in self._shared:
             config = self._hydra_config(overrides)
             conf = to_conf(config)
             plans.check_sizes(conf)
             following = following_seed(config)
             if following in ({}, {"variant.seed": "${seed}"}):
                 self._shared[others] = conf, bool(following)
-        self._confs[overrides] = conf
+            return conf
+        conf, follows = self._shared[others]
+        for seed in [int(of[1]) for text in overrides if (of := _SEED.fullmatch(text))]:
+            conf = replace(conf, seed=seed)
+            conf = replace(conf, variant=replace(conf.variant, seed=seed)) if follows else conf
         return conf
 
     def _hydra_config(self, overrides: tuple[str, ...]) -> DictConfig:

@@ -78,7 +78,7 @@ def run_names(row: Mapping[str, Any] | pd.Series) -> dict[str, str]:
 
 
 #: The most runs on the page. Nobody looks through more, and the CSV files have all.
-_MAX_RUNS = 200
+_MAX_RUNS = 100
 
 
 def runs(content: Content, comparison: Comparison) -> list[pd.DataFrame]:
