@@ -120,6 +120,16 @@ def to_conf(cfg: DictConfig) -> Conf:
     return conf
 
 
+def following_seed(cfg: DictConfig) -> dict[str, str]:
+    """Return the texts that interpolate `seed`, by their keys, as `variant.seed=${seed}` does."""
+    from omegaconf import OmegaConf
+
+    values = cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=False))
+    values.pop("hydra", None)
+    texts = {key: str(value) for key, value in dotted(values)}
+    return {key: text for key, text in texts.items() if "${" in text and "seed" in text}
+
+
 def dotted(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Yield the values of nested dicts with their dotted keys, as `splat.densify.every`."""
     for name, value in values.items():
@@ -209,6 +219,11 @@ def from_dict(values: Any) -> Conf:
     """
     for _, _, key in _missing(values, Conf):
         raise XrgsError(f"{key}: is missing")
+    return _complete(values)
+
+
+def _complete(values: Any) -> Conf:
+    """Convert nested dicts that have every key and no other; raises as `from_dict`."""
     try:
         conf = msgspec.convert(values, Conf)
     except msgspec.ValidationError as error:
@@ -282,9 +297,10 @@ def from_file(file: Path) -> tuple[Conf, dict[str, Any]]:
         _move_to_plugins(values)
         for group, name, key in _missing(values, Conf):
             value = reduce(getitem, key.split("."), _baseline())
-            if value != _OPEN:
-                group[name] = added[key] = deepcopy(value)
-        return from_dict(values), added
+            if value == _OPEN:
+                raise XrgsError(f"{key}: is missing")
+            group[name] = added[key] = deepcopy(value)
+        return _complete(values), added
     except XrgsError as error:
         raise XrgsError(f"{file}: {error} (another version of xrgs may have written it)") from error
 

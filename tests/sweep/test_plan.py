@@ -176,13 +176,14 @@ def test_the_use_of_memory_and_disk_is_that_of_the_cells_that_are_left(
 def test_a_label_whose_cells_have_the_config_of_the_baseline_is_named(
     cell: Callable[..., PlannedCell],
 ) -> None:
-    base = cell("baseline")
+    base = replace(cell("baseline"), cell_id=None)  # its variant is not built
     same = replace(base, spec=CellSpec("idle", "", (), ("x=1",)))
     steps = replace(base.conf, train=replace(base.conf.train, steps=11))
     other = replace(base, spec=CellSpec("other", "", (), ("y=1",)), conf=steps)
-    assert unchanged([base, same, other]) == [
-        "idle changes nothing here: its cells are those of baseline"
-    ]
+    line = "idle changes nothing here: its cells are those of baseline"
+    assert unchanged([base, same, other]) == [line]
+    built = zip((base, same, other), ("a", "a", "b"), strict=True)
+    assert unchanged([replace(one, cell_id=name) for one, name in built]) == [line]
     again = replace(other, spec=CellSpec("more+other", "", (), ("z=1",)))
     assert unchanged([base, other, again]) == [
         "more+other changes nothing here: its cells are those of other"

@@ -87,7 +87,8 @@ def test_seeds_share_one_composed_config_and_each_cell_is_identified_once(
     study: Callable[..., Study], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = study()
-    plan = made._plan(["+ablation=consistency", "seed=3,4", "variant.seed=${seed}"])
+    words = ["preset=laptop", "+ablation=consistency", "seed=3,4", "variant.seed=${seed}"]
+    plan = made._plan(words)
     assert [cell.conf.seed for cell in plan] == [3, 3, 4, 4]
     assert [cell.conf.variant.seed for cell in plan] == [3, 3, 4, 4]
     assert len(made._context.config_loader.composed) == 2  # type: ignore[attr-defined]
@@ -97,6 +98,11 @@ def test_seeds_share_one_composed_config_and_each_cell_is_identified_once(
     ]
     rows = record(plan)
     assert {(row.variant_seed, row.seed, row.condition) for row in rows} == {(3, 3, ""), (4, 4, "")}
+    assert [cell.conf for cell in plan] == [
+        composed_by_hydra(*cell.spec.overrides) for cell in plan
+    ]
+    others = made._plan(["seed=3,4", "variant.sfm.seed=${seed}"])
+    assert [cell.conf.variant.sfm.seed for cell in others] == [3, 4]
     store = Store(tmp_path / "s")
     store.prepare()
     plan = made._identified([replace(cell, variant_id="v") for cell in plan], store)

@@ -196,7 +196,7 @@ def identified(cell: PlannedCell, store: Store, holders: Mapping[str, str]) -> P
     name = cell.cell_id or cell_id(identity)
     folder = store.cell(name)
     state = folder.state(owner=holders.get(name))
-    trained = folder.steps_to_resume() / cell.conf.train.steps
+    trained = 0.0 if state.name == "done" else folder.steps_to_resume() / cell.conf.train.steps
     return replace(cell, identity=identity, cell_id=name, state=state, trained=trained)
 
 
@@ -315,7 +315,7 @@ def unchanged(plan: Sequence[PlannedCell]) -> list[str]:
     labels: dict[str, dict[tuple[str, ...], Any]] = {}
     for cell in plan:
         # The config of a cell that waits for a count is not complete: it is like no other.
-        values = object() if cell.waits else _deciding_values(cell)
+        values = object() if cell.waits else cell.cell_id or _deciding_values(cell)
         labels.setdefault(cell.spec.label, {})[cell.spec.shared] = values
     lines = []
     for place, (label, runs) in enumerate(labels.items()):
@@ -338,7 +338,7 @@ def unchanged(plan: Sequence[PlannedCell]) -> list[str]:
 
 
 def _deciding_values(cell: PlannedCell) -> tuple[Any, ...]:
-    """Return what decides a cell's numbers, also while its variant is not built."""
+    """Return what decides a cell's numbers while its variant is not built, and it has no id."""
     conf = cell.conf
     settings = [identity_values(group) for group in (conf.splat, conf.train, conf.components)]
     return (*settings, conf.variant, conf.scene, conf.seed)

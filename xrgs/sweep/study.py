@@ -35,7 +35,7 @@ from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf, flag_override
 from omegaconf.errors import OmegaConfBaseException
 
-from xrgs.composing import escape_interpolations, to_conf
+from xrgs.composing import escape_interpolations, following_seed, to_conf
 from xrgs.config import Conf
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.evaluation.lpips import weights
@@ -68,6 +68,8 @@ from xrgs.sweep.monitor import SweepMonitor
 from xrgs.sweep.plan import PlannedCell
 from xrgs.sweep.status import ending
 
+#: An override that sets the seed within its limits.
+_SEED = re.compile(r"seed=(0|[1-9]\d{0,17})")
 #: An override that sets a key to a number.
 _NUMBER = re.compile(r"([\w.]+)=((?:0|[1-9]\d*)(?:\.\d+)?)")
 #: Outcome of a job without an answer; the cell may be launched again.
@@ -90,7 +92,8 @@ class Study:
         self._task = task
         self._config = config
         self._composed: dict[tuple[str, ...], DictConfig] = {}
-        self._confs: dict[tuple[str, ...], Conf] = {}
+        self._shared: dict[tuple[str, ...], tuple[Conf, bool]] = {}
+        """By the overrides without the seed: a config, and whether `variant.seed` follows `seed`"""
         self._store: Store | None = None
         """None until the store is prepared."""
 
@@ -263,13 +266,25 @@ class Study:
         return replace(cell, spec=spec, conf=self._compose(spec))
 
     def _compose(self, spec: CellSpec) -> Conf:
-        """Return a cell's config, composed once however often it is asked for."""
+        """Return a cell's config.
+
+        Cells that differ only in their seed share one, unless more than `variant.seed` follows it.
+        """
         overrides = tuple(spec.overrides)
-        if overrides not in self._confs:
-            conf = to_conf(self._hydra_config(overrides))
+        others = tuple(text for text in overrides if not _SEED.fullmatch(text))
+        if others not in self._shared:
+            config = self._hydra_config(overrides)
+            conf = to_conf(config)
             plans.check_sizes(conf)
-            self._confs[overrides] = conf
-        return self._confs[overrides]
+            following = following_seed(config)
+            if following in ({}, {"variant.seed": "${seed}"}):
+                self._shared[others] = conf, bool(following)
+            return conf
+        conf, follows = self._shared[others]
+        for seed in [int(of[1]) for text in overrides if (of := _SEED.fullmatch(text))]:
+            conf = replace(conf, seed=seed)
+            conf = replace(conf, variant=replace(conf.variant, seed=seed)) if follows else conf
+        return conf
 
     def _hydra_config(self, overrides: tuple[str, ...]) -> DictConfig:
         """Return Hydra's config. Configs that differ only in numbers share one composition.

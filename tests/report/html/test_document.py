@@ -22,7 +22,7 @@ from xrgs.formats.ply import save_ply
 from xrgs.photos import images
 from xrgs.report import build
 from xrgs.report.compare import compare
-from xrgs.report.html import document
+from xrgs.report.html import content, document
 from xrgs.report.html.content import summary
 from xrgs.report.html.images import Album, error_map
 from xrgs.store.store import Store
@@ -238,6 +238,26 @@ def test_without_pictures_there_are_tables_and_the_arms_that_differ(
     assert "<td>1 HR (48 × 36 px); 2 LR (24 × 18 px); 2 test (48 × 36 px)</td>" in text
     caution = '<p class="warning">Caution: fern has 2 scored views: its scores say little of other'
     assert caution in text
+
+
+def test_a_page_has_the_first_replicates_of_all_scenes_and_says_how_many_it_leaves_out(
+    made: MadeStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for seed in (0, 1):
+        for scene in ("fern", "leaves"):
+            made.add(scene=scene, seed=seed)
+            made.add("consistency", scene=scene, seed=seed)
+    made.write()
+    monkeypatch.setattr(content, "_MAX_RUNS", 3)
+    report = build(made.store.path, pictures=[])
+    data = data_of(report.folder / "report.html")
+    shown = [("fern", "0/0"), ("leaves", "0/0"), ("fern", "0/1")]
+    for part in ("views", "history"):
+        runs = [(of["scene"], of["replicate"]) for of in data[part]]
+        assert list(dict.fromkeys(runs)) == shown
+        assert {runs.count(run) for run in shown} == {2}, "two views, and two cells"
+    assert any(note.startswith("Views and curves are of 3 of 4 runs (") for note in data["notes"])
+    assert (report.folder / "views.csv").read_text().count("\n") == 1 + 8 * 2
 
 
 def test_the_summary_of_one_label_keeps_conditions_apart(tmp_path: Path) -> None:

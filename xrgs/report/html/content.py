@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -77,20 +77,30 @@ def run_names(row: Mapping[str, Any] | pd.Series) -> dict[str, str]:
     }
 
 
-def runs(comparison: Comparison) -> Iterator[pd.DataFrame]:
-    """Yield the finished cells of each scene, condition and replicate, the base first.
+#: The most runs on the page. Nobody looks through more, and the CSV files have all.
+_MAX_RUNS = 100
+
+
+def runs(content: Content, comparison: Comparison) -> list[pd.DataFrame]:
+    """Return the finished cells of each scene, condition and replicate on the page, the base first.
 
     They are rows of `Comparison.cells`, one for each label. The first replicates of all scenes and
-    conditions come before the second ones.
+    conditions come before the second ones. Of more than `_MAX_RUNS` runs the others are left out,
+    and a note says so.
     """
     cells = comparison.cells
     done = cells[cells["state"] == "done"].drop_duplicates([*RUN, "label"])
     done = done.sort_values("label", key=lambda label: label != comparison.base, kind="stable")
-    groups = [rows for _, rows in done.groupby(RUN, sort=True)]
-    firsts = pd.concat([rows.iloc[:1] for rows in groups]) if groups else done
-    ranks = firsts.groupby(["scene", "condition"]).cumcount().to_numpy()
-    for place in ranks.argsort(kind="stable"):
-        yield groups[place]
+    names = done[RUN].drop_duplicates().sort_values(RUN)
+    ranks = names.groupby(["scene", "condition"]).cumcount()
+    first = names.loc[ranks.sort_values(kind="stable").index[:_MAX_RUNS]]
+    if len(first) < len(names):
+        content.notes.append(
+            f"Views and curves are of {len(first)} of {len(names)} runs (a scene, condition and"
+            " replicate); views.csv and curves.csv have all."
+        )
+    groups = done.groupby(RUN, sort=False)
+    return [groups.get_group(name) for name in first.itertuples(index=False, name=None)]
 
 
 #: Columns of a history that the page shows, in its order.
@@ -109,18 +119,19 @@ RULES = (
 _MAX_ROWS = 240
 
 
-def add_curves(content: Content, quality: pd.DataFrame) -> None:
-    """Add the quality during training of each cell that was evaluated during training."""
-    keys = [*RUN, "label"]
-    for _, rows in quality.groupby(keys, sort=False):
+def add_curves(content: Content, of_runs: Sequence[pd.DataFrame], quality: pd.DataFrame) -> None:
+    """Add the quality during training of each of these cells that was evaluated during training."""
+    ids = {cell_id for rows in of_runs for cell_id in rows["cell_id"]}
+    quality = quality[quality["cell_id"].isin(ids)]
+    for _, rows in quality.groupby([*RUN, "label"], sort=False):
         first = rows.iloc[0]
         columns = {name: [finite(value) for value in rows[name]] for name in CURVE_COLUMNS}
         content.curves.append(run_names(first) | {"label": shown(first["label"])} | columns)
 
 
-def add_history(content: Content, store: ReportStore, comparison: Comparison) -> None:
-    """Add the counts over steps (`RULES`) of each finished cell."""
-    for rows in runs(comparison):
+def add_history(content: Content, store: ReportStore, of_runs: Sequence[pd.DataFrame]) -> None:
+    """Add the counts over steps (`RULES`) of each of these cells."""
+    for rows in of_runs:
         for _, row in rows[~rows["cell_id"].isin(store.external)].iterrows():
             try:
                 history = number_columns(store.cell(row["cell_id"]).path / HISTORY)

@@ -31,6 +31,7 @@ from xrgs.report.html.content import (
     answers,
     finite,
     page_context,
+    runs,
     shown,
     summary,
     why,
@@ -70,12 +71,13 @@ def write_document(
     """
     comparison, content = tables.comparison, Content()
     variants = _variants(store, comparison.cells, content)
-    add_views(content, store, comparison, sweep.views, _VIEW_BYTES * pictures)
-    add_curves(content, quality)
-    add_history(content, store, comparison)
+    shown_runs = runs(content, comparison)
+    add_views(content, store, shown_runs, sweep.views, _VIEW_BYTES * pictures)
+    add_curves(content, shown_runs, quality)
+    add_history(content, store, shown_runs)
     add_trade_offs(content, comparison)
     if pictures:
-        add_trained(content, store, comparison, variants, _TRAINING_BYTES, _MODEL_BYTES)
+        add_trained(content, store, shown_runs, variants, _TRAINING_BYTES, _MODEL_BYTES)
     else:
         content.notes.append("Photographs, renders and models were left out: --pictures none.")
     single = not comparison.groups

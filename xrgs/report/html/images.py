@@ -25,8 +25,7 @@ from xrgs.mixture.views import Variant
 from xrgs.photos import images
 from xrgs.photos.images import ImageError
 from xrgs.report.collect import ReportStore
-from xrgs.report.compare import Comparison
-from xrgs.report.html.content import Content, finite, run_names, runs, shown, why
+from xrgs.report.html.content import Content, finite, run_names, shown, why
 from xrgs.report.pictures import MAX_PIXELS
 from xrgs.runtime.progress import progress
 
@@ -116,24 +115,24 @@ def error_map(photograph: Image.Image, render: Image.Image) -> Image.Image:
 def add_views(
     content: Content,
     store: ReportStore,
-    comparison: Comparison,
+    of_runs: Sequence[pd.DataFrame],
     views: pd.DataFrame,
     max_bytes: int,
 ) -> None:
-    """Add all scored views of all cells, with images until `max_bytes` are used.
+    """Add all scored views of the cells of runs, with images until `max_bytes` are used.
 
     The first replicates of all scenes come first, each with its worst view first. From the first
     view on whose images do not fit, views have only their scores, and a note counts these views.
     """
+    ids = {cell_id for cells in of_runs for cell_id in cells["cell_id"]}
+    views = views[views["cell_id"].isin(ids)]
     scores: _Scores = {
         (row["cell_id"], row["view"]): {name: finite(row[name]) for name in VIEW_METRICS}
         for row in views.to_dict("records")
     }
     names = {str(name): list(rows["view"]) for name, rows in views.groupby("cell_id")}
     wanted = [
-        (cells, view, entry)
-        for cells in runs(comparison)
-        for view, entry in _entries(cells, names, scores)
+        (cells, view, entry) for cells in of_runs for view, entry in _entries(cells, names, scores)
     ]
     pixels = sum(_pixels(store, cells, view) for cells, view, _ in wanted) if max_bytes else 0
     album = Album(content.images, max_bytes, int(pixels * _WITH_ERROR_MAPS))
@@ -243,7 +242,7 @@ def _add_images(
 def add_trained(
     content: Content,
     store: ReportStore,
-    comparison: Comparison,
+    of_runs: Sequence[pd.DataFrame],
     variants: dict[str, Variant],
     max_image_bytes: int,
     max_model_bytes: int,
@@ -253,7 +252,7 @@ def add_trained(
     They come from the first replicate of each scene and condition whose variant can be read.
     """
     first: dict[tuple[str, str], pd.DataFrame] = {}
-    for rows in runs(comparison):
+    for rows in of_runs:
         first.setdefault((rows["scene"].iloc[0], rows["condition"].iloc[0]), rows)
     chosen = list(islice(first.values(), _MAX_RUNS))
     if len(chosen) < len(first):
