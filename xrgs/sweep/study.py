@@ -92,6 +92,8 @@ class Study:
         self._task = task
         self._config = config
         self._composed: dict[tuple[str, ...], DictConfig] = {}
+        self._confs: dict[tuple[str, ...], Conf] = {}
+        """By all overrides of a cell."""
         self._shared: dict[tuple[str, ...], tuple[Conf, bool]] = {}
         """By the overrides without the seed: a config, and whether `variant.seed` follows `seed`"""
         self._store: Store | None = None
@@ -266,20 +268,21 @@ class Study:
         return replace(cell, spec=spec, conf=self._compose(spec))
 
     def _compose(self, spec: CellSpec) -> Conf:
-        """Return a cell's config.
+        """Return a cell's config, composed once however often it is asked for.
 
         Cells that differ only in their seed share one, unless more than `variant.seed` follows it.
         """
         overrides = tuple(spec.overrides)
         others = tuple(text for text in overrides if not _SEED.fullmatch(text))
         if others not in self._shared:
-            config = self._hydra_config(overrides)
-            conf = to_conf(config)
-            plans.check_sizes(conf)
-            following = following_seed(config)
-            if following in ({}, {"variant.seed": "${seed}"}):
-                self._shared[others] = conf, bool(following)
-            return conf
+            if overrides not in self._confs:
+                config = self._hydra_config(overrides)
+                self._confs[overrides] = conf = to_conf(config)
+                plans.check_sizes(conf)
+                following = following_seed(config)
+                if following in ({}, {"variant.seed": "${seed}"}):
+                    self._shared[others] = conf, bool(following)
+            return self._confs[overrides]
         conf, follows = self._shared[others]
         for seed in [int(of[1]) for text in overrides if (of := _SEED.fullmatch(text))]:
             conf = replace(conf, seed=seed)
