@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 _INTERPOLATION = re.compile(r"(\\*)\$\{")
 #: The key at the end of msgspec's error messages: "... - at `$.train.steps`".
 _AT = re.compile(r" - at `\$\.?(.*)`$")
+#: OmegaConf's message if null is given for a key that takes a value.
+_NOT_NULL = re.compile(r"field '([^']+)' is not Optional")
 #: Placeholder in `conf/config.yaml` for a value that the files of `conf/scene/` set.
 _OPEN = "???"
 _HYDRA_LOCK = threading.Lock()
@@ -348,4 +350,5 @@ def error_line(error: Exception) -> str:
         One line, prefixed with the key if the message does not contain it.
     """
     line, key = str(error).splitlines()[0], getattr(error, "full_key", None)
+    line = _NOT_NULL.sub(r"\1: takes a value, and not null", line)
     return line if not key or key in line else f"{key}: {line}"
