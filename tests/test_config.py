@@ -227,10 +227,23 @@ def test_the_splat_librarys_defaults_are_the_baselines(group: str, compose: Comp
         ("train.hr_share=-0.1", "train.hr_share=-0.1: must be at least 0 and below 1"),
         ("splat.backend=cuda", "splat.backend=cuda: must be one of "),
         ("retry=all", "retry=all: must be one of "),
+        ("splat.sh_every=0", "splat.sh_every=0: must be at least 1"),
+        ("splat.init_opacity=1", "splat.init_opacity=1.0: must be above 0 and below 1"),
+        ("splat.ssim_weight=1.5", "splat.ssim_weight=1.5: must be at least 0 and at most 1"),
+        ("splat.densify.every=-1", "splat.densify.every=-1: must be at least 1; splat.den"),
+        (
+            "splat.densify.reset_every=0",
+            "splat.densify.reset_every=0: must be at least 1; splat.densify.resets=false",
+        ),
         # Numbers that nothing can hold.
         (f"seed={2**63}", f"seed={2**63}: must be below 2^"),
         (f"variant.sfm.seed={2**63}", f"variant.sfm.seed={2**63}: must be below 2^"),
         (f"+components.plugins.p.n={2**63}", f"components.plugins.p.n={2**63}: must be below 2^"),
+        # Numbers that the config.json of a cell can't hold.
+        ("splat.optimizer.means=inf", "splat.optimizer.means=inf: must be finite"),
+        ("checkpoint_s=inf", "checkpoint_s=inf: must be finite"),
+        ("splat.raster.background=[0,nan,0]", "scene.background=[0.0, nan, 0.0]: must be finite"),
+        ("+components.plugins.p.x=-inf", "components.plugins.p.x=-inf: must be finite"),
         # Keys that a plus adds to the schema.
         ("+variant.bogus=1", "variant.bogus: there is no such key"),
         ("+components.mip.bogus=1", "components.mip.bogus: there is no such key"),

@@ -6,6 +6,7 @@ reads its config from a file, does not need them.
 
 from __future__ import annotations
 
+import math
 import re
 import threading
 from collections.abc import Iterator, Mapping
@@ -33,6 +34,8 @@ if TYPE_CHECKING:
 _INTERPOLATION = re.compile(r"(\\*)\$\{")
 #: The key at the end of msgspec's error messages: "... - at `$.train.steps`".
 _AT = re.compile(r" - at `\$\.?(.*)`$")
+#: OmegaConf's message if null is given for a key that takes a value.
+_NOT_NULL = re.compile(r"field '([^']+)' is not Optional")
 #: Placeholder in `conf/config.yaml` for a value that the files of `conf/scene/` set.
 _OPEN = "???"
 _HYDRA_LOCK = threading.Lock()
@@ -115,6 +118,11 @@ def to_conf(cfg: DictConfig) -> Conf:
         if path is not None and path.startswith("~"):
             setattr(group, name, str(user_path(path)))
     _check_limits(conf)
+    for key, value in dotted(values):
+        for number in value if isinstance(value, list) else [value]:
+            if isinstance(number, float) and not math.isfinite(number):  # JSON has no such number
+                raise XrgsError(f"{key}={value}: must be finite")
+    _check_periods(conf)
     _check_strategy(conf)
     _check_views(conf)
     return conf
@@ -153,6 +161,20 @@ def _check_limits(group: Any, path: str = "") -> None:
     for name, inner in vars(group).items():
         if is_dataclass(inner) and (is_on(inner) or not isinstance(group, ComponentsConf)):
             _check_limits(inner, f"{path}{name}.")
+
+
+#: Keys of periods in steps -> how to switch off what they repeat. 0 is no period.
+_PERIODS = {
+    "splat.densify.every": "splat.densify.stop=0 refines nothing",
+    "splat.densify.reset_every": "splat.densify.resets=false resets nothing",
+}
+
+
+def _check_periods(conf: Conf) -> None:
+    """Raise `XrgsError` for a period below 1, which training would take for every step."""
+    for key, instead in _PERIODS.items():
+        if (steps := _value(conf, key)) < 1:
+            raise XrgsError(f"{key}={steps}: must be at least 1; {instead}")
 
 
 def _check_strategy(conf: Conf) -> None:
@@ -344,4 +366,5 @@ def error_line(error: Exception) -> str:
         One line, prefixed with the key if the message does not contain it.
     """
     line, key = str(error).splitlines()[0], getattr(error, "full_key", None)
+    line = _NOT_NULL.sub(r"\1: takes a value, and not null", line)
     return line if not key or key in line else f"{key}: {line}"

@@ -121,10 +121,10 @@ class SplatConf:
     densify: DensifySettings
     strategy: str = off("default", choices=STRATEGIES)
     init: str = off("sfm", choices=STARTS)
-    sh_every: int
-    init_opacity: float
+    sh_every: int = limited(least=1)
+    init_opacity: float = limited(above=0, below=1)
     init_scale: float = off(1.0, finite=True, above=0)
-    ssim_weight: float
+    ssim_weight: float = limited(least=0, most=1)
     backend: str = limited(choices=CHOICES)
 
 

@@ -252,6 +252,9 @@ def test_an_error_of_a_file_that_is_no_yaml_of_the_config_stays(tmp_path: Path) 
     [
         (["scene=fern"], "scene=fern: there is no such choice; did you mean llff/fern?"),
         (["+steps=100"], "steps: there is no such key; did you mean train.steps"),
+        (["train={stepz:5}"], "train.stepz: there is no such key; did you mean train.steps"),
+        (["variant={sfm:{sed:1}}"], "variant.sfm.sed: there is no such key; did you mean variant"),
+        (["seed=null"], "seed: takes a value, and not null"),
         (["ablaton=consistency"], "ablaton: there is no such key; did you mean ablation?"),
         (["seed=["], "seed=[: "),
         (["garden"], "garden: to train on these photographs, type: xrgs-train garden"),

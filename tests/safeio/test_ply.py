@@ -126,6 +126,12 @@ def test_every_name_of_a_type(tmp_path: Path, name: str) -> None:
     np.testing.assert_array_equal(read.vertices["x"], values)
 
 
+def test_blank_lines_of_a_header_are_read_over(tmp_path: Path) -> None:
+    header = "comment a\n\nelement vertex 1\n \nproperty uchar x"
+    read = ply.read(write(tmp_path / "a.ply", header, b"\x07"))
+    assert (read.vertices["x"].tolist(), read.comments) == ([7], ("a",))
+
+
 def test_a_body_may_begin_with_the_bytes_of_a_line_end(tmp_path: Path) -> None:
     header = "element vertex 1\nproperty uchar x\nproperty uchar y"
     for end in ("\n", "\r\n", "\r"):

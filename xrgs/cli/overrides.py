@@ -129,6 +129,9 @@ def _explained(error: Exception) -> str:
         return _wrong_file(match[1], error.__context__ or error)
     if match := _NOT_OVERRIDDEN.search(str(error)):
         key = match[1].partition("@")[0]
+        inner = str(getattr(error.__cause__, "full_key", ""))
+        if inner.startswith(f"{key}."):  # of train={stepz:5}
+            key = inner
         why = f"there is no such key{did_you_mean(key, config.known_keys())}"
         if key.startswith("components.plugins."):
             why = f"a setting of another package's component has a + before it: +{key}=..."

@@ -122,6 +122,8 @@ def _parse_header(lines: Iterable[str]) -> tuple[str, list[_Element], tuple[str,
     elements: list[_Element] = []
     for line in lines:
         match line.split():
+            case []:  # some programs write blank lines
+                pass
             case ["comment" | "obj_info", *_]:
                 comments.append(" ".join(line.split(maxsplit=1)[1:]).rstrip())
             case ["format", name, "1.0"] if name in _BYTE_ORDERS and not form:

@@ -161,6 +161,14 @@ def test_names_with_spaces_are_read_whole(tmp_path: Path) -> None:
     assert given.names == [NAMES[0], "DJI 1 2.jpg", NAMES[2]]
 
 
+def test_text_with_a_byte_order_mark_is_read(tmp_path: Path) -> None:
+    """As editors of Windows write it, before a comment and before an entry."""
+    folder = edited(tmp_path / "a", "images.txt", lambda lines: ["\ufeff" + lines[0], *lines[1:]])
+    cameras = folder / "cameras.txt"
+    cameras.write_bytes(b"\xef\xbb\xbf# edited\n" + cameras.read_bytes())
+    assert colmap.read(folder).names == list(NAMES)
+
+
 @pytest.mark.parametrize(
     ("file", "change", "message"),
     [

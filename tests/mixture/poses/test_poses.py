@@ -154,6 +154,12 @@ def test_the_fingerprint_is_of_the_content(tmp_path: Path) -> None:
         (("./train/r_0", "./test/r_0"), ("train/r_0", "test/r_0"), 1),
         (("frame.0001", "frame.0002"), ("frame.0001", "frame.0002"), 1),
         (("a 1.jpg", "b.c.d.jpg"), ("a 1", "b.c.d"), 1),
+        # Names with dots, whose suffix is omitted; a pose without that suffix has precedence.
+        (("./x/5.1.2024_a", "./x/5.1.2024_b"), ("x/5.1.2024_a", "x/5.1.2024_b"), 1),
+        (("1.left", "1.right"), ("1.left", "1.right"), 1),
+        (("a.png", "b.png"), ("a.png", "a", "b"), {0: 1, 1: 2}),
+        # Accents apart, as macOS writes them into names of files, and composed.
+        (("x/u\u0308.jpg", "\u00e9.jpg"), ("x/\u00fc", "e\u0301"), 1),
     ],
 )
 def test_a_pose_has_the_photograph_at_the_end_of_its_path(

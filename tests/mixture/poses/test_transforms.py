@@ -198,6 +198,15 @@ def test_keys_that_are_not_read_are_named(tmp_path: Path) -> None:
     assert given.points.shape == (0, 3)
 
 
+def test_a_file_of_windows_is_read(tmp_path: Path) -> None:
+    """With a byte order mark, and backslashes in paths."""
+    file = write_transforms(tmp_path / "a", {"ply_file_path": ".\\points.ply"})
+    file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes())
+    given = transforms.read([file])
+    assert np.allclose(given.points, POINTS, atol=1e-6)
+    assert transforms.files([file]) == [file, tmp_path / "a" / "points.ply"]
+
+
 def test_the_parts_of_blender_are_read_as_one(tmp_path: Path) -> None:
     """Each part has an angle of its own; the first points that any of them names are taken."""
     parts = []
@@ -223,6 +232,8 @@ def test_masks_are_named_by_image(tmp_path: Path) -> None:
     mask = tmp_path / "a" / "masks" / "a.png"
     assert transforms.masks([file]) == {f"./images/{name}": mask for name in NAMES}
     assert mask in transforms.files([file])
+    windows = write_transforms(tmp_path / "w", {}, {"mask_path": ".\\masks\\a.png"})
+    assert {*transforms.masks([windows]).values()} == {tmp_path / "w" / "masks" / "a.png"}
     file = write_transforms(tmp_path / "b", {}, {"mask_path": "../a.png"})
     with pytest.raises(XrgsError, match="mask_path must be a path below the folder"):
         transforms.masks([file])

@@ -7,6 +7,7 @@ with the same folders and name; suffixes are ignored.
 from __future__ import annotations
 
 import hashlib
+import unicodedata
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -268,15 +269,19 @@ def match_names(poses: Sequence[str], photographs: Sequence[tuple[str, Path]]) -
     Raises:
         XrgsError: No pose matches a photograph, or two poses match a photograph equally well.
     """
+    photographs = [(_composed(name), Path(_composed(str(file)))) for name, file in photographs]
     ends: dict[str, set[int]] = {}  # end of a path -> its photographs
     for i, (name, file) in enumerate(photographs):
         for end in (name, file.stem):
             ends.setdefault(end, set()).add(i)
     fits: dict[int, list[tuple[int, str]]] = {}
     for pose in poses:
-        parts = _parts(pose)
-        same_end = set().union(*(ends.get("_".join(parts[n:]), ()) for n in range(len(parts))))
-        scores = {i: score for i in same_end if (score := _shared(parts, *photographs[i]))}
+        scores: dict[int, int] = {}
+        for parts in _readings(pose):
+            same_end = set().union(*(ends.get("_".join(parts[n:]), ()) for n in range(len(parts))))
+            scores = scores or {
+                i: score for i in same_end if (score := _shared(parts, *photographs[i]))
+            }
         best = [i for i, score in scores.items() if score == max(scores.values())]
         if len(best) == 1:
             fits.setdefault(best[0], []).append((scores[best[0]], pose))
@@ -299,11 +304,21 @@ def match_names(poses: Sequence[str], photographs: Sequence[tuple[str, Path]]) -
     return found
 
 
-def _parts(path: str) -> tuple[str, ...]:
-    """Return folders and name, without suffix, of a path from any operating system."""
-    pure = PurePosixPath(path.replace("\\", "/"))
-    # Blender and other programs omit the suffix: .0001 of frame.0001 is not a suffix.
-    return pure.parts if pure.suffix[1:].isdigit() or not pure.name else pure.with_suffix("").parts
+def _readings(path: str) -> list[tuple[str, ...]]:
+    """Return folders and name of a path from any operating system: without and with its suffix.
+
+    Blender and other programs omit the suffix, so that what looks like one may be part of the name,
+    as in 05.01.2024_7. Digits always are: .0001 of frame.0001 is no suffix.
+    """
+    pure = PurePosixPath(_composed(path.replace("\\", "/")))
+    if pure.suffix[1:].isdigit() or not pure.name:
+        return [pure.parts]
+    return list(dict.fromkeys([pure.with_suffix("").parts, pure.parts]))
+
+
+def _composed(text: str) -> str:
+    """Compose letters and accents: macOS writes them apart into names of files."""
+    return unicodedata.normalize("NFC", text)
 
 
 def _shared(pose: Sequence[str], name: str, file: Path) -> int:

@@ -396,8 +396,8 @@ def _text_points(file: Path) -> _Points:
 
 
 def _lines(file: Path) -> Iterator[tuple[int, str]]:
-    """Yield line number, from 1, and line of a text file, without comments."""
-    content = read_file(file, _MAX_BYTES).decode("utf-8", errors="replace")
+    """Yield line number, from 1, and line of a text file, without comments and byte order mark."""
+    content = read_file(file, _MAX_BYTES).decode("utf-8-sig", errors="replace")
     for number, line in enumerate(content.split("\n"), 1):
         if not line.startswith("#"):
             yield number, line.strip()

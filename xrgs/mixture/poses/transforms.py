@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -17,7 +18,7 @@ from xrgs.photos import foreign
 from xrgs.photos.lens import MODELS, Lens, lens_of_model
 from xrgs.runtime.text import listed
 from xrgs.safeio.files import is_inside, list_names
-from xrgs.safeio.records import as_number, read_struct
+from xrgs.safeio.records import as_number, decode_struct, read_file
 
 #: Names in a folder: a file with all images, or one for each split, as in Blender's scenes.
 _WHOLE, _NAME = "transforms.json", re.compile(r"transforms(_\w+)?\.json")
@@ -115,7 +116,9 @@ def _contents(parts: Sequence[Path]) -> dict[Path, dict[str, Any]]:
 def _content(file: Path) -> dict[str, Any]:
     """Read a file, and check that its frames have names."""
     try:
-        content = read_struct(file, dict[str, Any], _MAX_BYTES)
+        # Some editors and shells of Windows write the mark, which JSON has not.
+        text = read_file(file, _MAX_BYTES).removeprefix(codecs.BOM_UTF8)
+        content = decode_struct(text, dict[str, Any], file)
     except UnreadableError:
         raise
     except StoreError as error:
@@ -148,7 +151,7 @@ def _masks(frames: Mapping[str, tuple[Path, Mapping[str, Any]]]) -> dict[str, Pa
 
 def _below(file: Path, key: str, name: object) -> Path:
     """Return the path of a file that a transforms.json names; it must be below its folder."""
-    inside = str(PurePosixPath(name)) if isinstance(name, str) else ""
+    inside = str(PurePosixPath(name.replace("\\", "/"))) if isinstance(name, str) else ""
     if not is_inside(inside):
         raise XrgsError(f"{file}: {key} must be a path below the folder of this file")
     return file.parent / inside
