@@ -122,7 +122,6 @@ def to_conf(cfg: DictConfig) -> Conf:
         for number in value if isinstance(value, list) else [value]:
             if isinstance(number, float) and not math.isfinite(number):  # JSON has no such number
                 raise XrgsError(f"{key}={value}: must be finite")
-    _check_periods(conf)
     _check_strategy(conf)
     _check_views(conf)
     return conf
@@ -161,20 +160,6 @@ def _check_limits(group: Any, path: str = "") -> None:
     for name, inner in vars(group).items():
         if is_dataclass(inner) and (is_on(inner) or not isinstance(group, ComponentsConf)):
             _check_limits(inner, f"{path}{name}.")
-
-
-#: Keys of periods in steps -> how to switch off what they repeat. 0 is no period.
-_PERIODS = {
-    "splat.densify.every": "splat.densify.stop=0 refines nothing",
-    "splat.densify.reset_every": "splat.densify.resets=false resets nothing",
-}
-
-
-def _check_periods(conf: Conf) -> None:
-    """Raise `XrgsError` for a period below 1, which training would take for every step."""
-    for key, instead in _PERIODS.items():
-        if (steps := _value(conf, key)) < 1:
-            raise XrgsError(f"{key}={steps}: must be at least 1; {instead}")
 
 
 def _check_strategy(conf: Conf) -> None:

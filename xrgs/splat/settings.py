@@ -122,23 +122,27 @@ class CullingOptions:
     """Skip Gaussians behind the last one that a pixel of the block composites."""
 
 
+#: Limits of a learning rate, where 0 keeps a parameter, and of a decay of Adam's moments.
+_RATE, _DECAY = {"least": 0}, {"least": 0, "below": 1}
+
+
 @dataclass
 class OptimizerSettings:
     """Adam's learning rate for each parameter, and its constants."""
 
-    means: float = 1.6e-4
+    means: float = field(default=1.6e-4, metadata=_RATE)
     """Rate of means at the first step, times the scene's scale; it decays exponentially."""
-    means_final: float = 0.01
+    means_final: float = field(default=0.01, metadata=_RATE)
     """Rate of means after the last step, as a fraction of the first rate."""
     means_decay_from: int = field(default=0, metadata={"least": 0, "below": NOMINAL_STEPS})
     """Step of a 30,000-step run at which the rate of means begins to decay; 0 is gsplat's."""
-    scales: float = 5e-3
+    scales: float = field(default=5e-3, metadata=_RATE)
     """Rate of log scales."""
-    opacities: float = 5e-2
+    opacities: float = field(default=5e-2, metadata=_RATE)
     """Rate of logit opacities."""
-    quats: float = 1e-3
-    sh0: float = 2.5e-3
-    shN: float = 2.5e-3 / 20  # noqa: N815
+    quats: float = field(default=1e-3, metadata=_RATE)
+    sh0: float = field(default=2.5e-3, metadata=_RATE)
+    shN: float = field(default=2.5e-3 / 20, metadata=_RATE)  # noqa: N815
     shN_every: int = field(default=1, metadata={"least": 1})  # noqa: N815
     """Steps between two updates of shN, whose rate is multiplied by this; 1 in gsplat."""
     length_power: float = off_by_default(0.0, least=0, most=1)
@@ -146,11 +150,11 @@ class OptimizerSettings:
     multiplied by (30,000 / steps)^p (`SplatOptimizer`). 0 keeps gsplat's rates."""
     length_decay_from: int = off_by_default(18_000, least=0, below=NOMINAL_STEPS)
     """Step of a 30,000-step run at which these rates begin to fall to gsplat's. Our choice."""
-    beta1: float = 0.9
+    beta1: float = field(default=0.9, metadata=_DECAY)
     """Decay of the first moment, per step."""
-    beta2: float = 0.999
+    beta2: float = field(default=0.999, metadata=_DECAY)
     """Decay of the second moment, per step."""
-    eps: float = 1e-15
+    eps: float = field(default=1e-15, metadata={"above": 0})
     """Added to the root of the second moment."""
 
 
@@ -167,8 +171,8 @@ class DensifySettings:
 
     start: int = 500
     stop: int = 15_000
-    every: int = 100
-    reset_every: int = 3_000
+    every: int = field(default=100, metadata={"least": 1})
+    reset_every: int = field(default=3_000, metadata={"least": 1})
     resets: bool = off_by_default(True)
     """Whether opacities are reset; gsplat 1.5.3 never resets (`xrgs.splat.strategy.default`)."""
     grow_grad2d: float = 2e-4
