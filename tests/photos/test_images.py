@@ -141,6 +141,25 @@ def test_a_file_that_is_no_image_is_named(tmp_path: Path) -> None:
         images.size(tmp_path / "a.png")
 
 
+@pytest.mark.parametrize("progressive", [False, True])
+def test_a_jpeg_whose_last_part_is_zeros_is_refused(
+    tmp_path: Path, noise: images.ImageArray, progressive: bool
+) -> None:
+    """An interrupted copy leaves it so; its thumbnail, which is in the header, is whole."""
+    photograph, small = io.BytesIO(), io.BytesIO()
+    Image.fromarray(images.to_8_bit(noise[:8, :8])).save(small, "JPEG")
+    exif = b"Exif\0\0" + small.getvalue()
+    picture = Image.fromarray(images.to_8_bit(noise))
+    picture.save(photograph, "JPEG", exif=exif, progressive=progressive)
+    content, file = photograph.getvalue(), tmp_path / "a.jpg"
+    file.write_bytes(content + bytes(100))
+    assert images.decode(file).pixels.shape == noise.shape
+    file.write_bytes(content[:-500] + bytes(500))
+    for read in (images.decode, lambda path: images.thumbnail(path, 16)):
+        with pytest.raises(ImageError, match=r"a\.jpg: unreadable or truncated"):
+            read(file)
+
+
 def test_shrinking_is_pillows_antialiased_bicubic(noise: images.ImageArray) -> None:
     small = images.resize(noise, 12, 8)
     for c in range(3):

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import imagecodecs
 import numpy as np
 import pandas as pd
 import pytest
@@ -201,6 +202,13 @@ def test_a_render_that_can_not_be_scored_is_named(
     assert message.startswith(str(file))
     assert why in message
     assert "expected is an 8-bit RGB PNG of 32 x 24 px, the render of the view IMG_009" in message
+
+
+def test_a_render_of_16_bits_is_refused(join: Callable[..., pd.DataFrame], tmp_path: Path) -> None:
+    file = rendered(tmp_path / "renders") / f"{VIEWS[1]}.png"
+    file.write_bytes(imagecodecs.png_encode(noise(0).astype(np.uint16) * 257))
+    with pytest.raises(ReportError, match="16 bits a channel; expected is an 8-bit RGB PNG"):
+        join(tmp_path / "renders")
 
 
 def test_a_label_of_the_sweep_is_refused(join: Callable[..., pd.DataFrame], tmp_path: Path) -> None:

@@ -139,13 +139,17 @@ def test_an_owner_s_age_is_told_by_the_file_server_s_clock(
     assert lease.acquire(folder, "cell") is None
 
 
-@pytest.mark.parametrize("text", ["", "{"])
-def test_a_lease_that_stays_unsigned_is_free_after_a_while(folder: Path, text: str) -> None:
+@pytest.mark.parametrize(("text", "seconds"), [("", 60.0), ("{", 600.0)])
+def test_a_lease_that_stays_unsigned_is_free_after_a_while(
+    folder: Path, text: str, seconds: float
+) -> None:
     file = folder / "cell.0"
     file.write_text(text)
     assert lease.acquire(folder, "cell") is None  # it may be about to be signed
     assert "not signed" in lease.holders(folder)["cell"]
-    dated(file, lease.SILENT_S + 1)
+    dated(file, seconds - 10)
+    assert lease.acquire(folder, "cell") is None
+    dated(file, seconds + 1)
     assert lease.acquire(folder, "cell") is not None
 
 

@@ -105,3 +105,15 @@ def test_new_scores_of_a_done_cell_are_part_of_it(done: CellFolder) -> None:
     done.rescored(["scores.csv"], {"psnr": "4567"})
     assert done.state().name == "done"
     assert done.status().scored_by == {"psnr": "4567"}
+
+
+def test_files_that_the_system_made_are_no_results(done: CellFolder) -> None:
+    # NFS keeps a file under such a name while somebody still reads it, and then removes it.
+    files = done.status().files
+    kept = done.path / "renders" / ".nfs000000000123"
+    kept.write_text("an older file that is open")
+    assert done.verify() == []
+    done.finish(["a", "b"], {"psnr": "0123"})
+    kept.unlink()
+    assert done.status().files == files
+    assert done.state().name == "done"

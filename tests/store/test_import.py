@@ -79,7 +79,9 @@ def test_a_store_is_imported_whole(foreign: Store, mine: Store, kind: str) -> No
     del expected[f"cells/{cell.id}/log.txt"]
     for name in ("checkpoint.npz", "progress.json"):
         (cell.path / name).write_text("not imported")
-    for name in ("hydra/a/b.yaml", "reports/x/report.html", "locks/a.0", "cells/a.aside-1/log.txt"):
+    of_the_system = (f"cells/{cell.id}/renders/.DS_Store", f"scenes/{SCENE}/._v0.png")
+    parts = ("hydra/a/b.yaml", "reports/x/report.html", "locks/a.0", "cells/a.aside-1/log.txt")
+    for name in (*parts, *of_the_system):
         (foreign.path / name).parent.mkdir(parents=True, exist_ok=True)
         (foreign.path / name).write_text("not imported")
     source = foreign.path

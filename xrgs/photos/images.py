@@ -296,6 +296,20 @@ class _PilFile:
                 return colour.adobe_rgb()
         return None
 
+    def check_end(self) -> None:
+        """Raise `ValueError` for a JPEG whose last part is zeros, or was never written.
+
+        An interrupted copy leaves such a file at its full size. Zeros are valid codes of JPEG, so
+        that PIL decodes them to grey without an error; only the marker of the end is missing.
+        """
+        if self.image.format not in ("JPEG", "MPO"):
+            return
+        self._stream.seek(2)
+        while (head := self._stream.read(4))[:1] == b"\xff" and head[1:2] != b"\xda":
+            self._stream.seek(int.from_bytes(head[2:], "big") - 2, 1)
+        if head[1:2] == b"\xda" and b"\xff\xd9" not in self._stream.read():
+            raise ValueError("it ends within its pixels")
+
     def load(self) -> tiff.Samples:
         """Decode the pixels."""
         image: Image.Image = self.image
@@ -307,6 +321,7 @@ class _PilFile:
                 return tiff.of_grey(np.asarray(image))
             significant = max(self._chunks.get(b"sBIT", b"\x10"))
             return tiff.decode_png(self._stream.read(), significant)
+        self.check_end()
         image.load()
         upright = image.format in ("HEIF", "TIFF")
         if image.mode == "LAB":
@@ -448,6 +463,7 @@ def thumbnail(path: Path, side: int) -> NDArray[np.uint8]:
         file = _file(stream, path)
         if isinstance(file, _PilFile) and file.bits <= 8:
             # JPEGs are decoded at down to an eighth of their size.
+            file.check_end()
             file.image.draft("RGB", (16 * side, 16 * side))
             upright = ImageOps.exif_transpose(file.image).convert("RGB")
             return _small(upright, side)

@@ -20,7 +20,7 @@ from msgspec import Meta
 from xrgs.evaluation.metrics import VIEW_METRICS
 from xrgs.evaluation.protocol import score_file
 from xrgs.mixture import variant
-from xrgs.photos.images import ImageError
+from xrgs.photos.images import ImageError, header
 from xrgs.report.collect import ReportError, ReportStore, Sweep
 from xrgs.runtime.progress import progress
 from xrgs.safeio.files import is_inside
@@ -126,6 +126,9 @@ def _with_program(sweep: Sweep, store: ReportStore, program: External) -> Sweep:
         for name in bar:
             view, file = expected[name], folder / f"{name}.png"
             try:
+                # PIL would cut 16 bits to 8, which makes a render darker by half a step.
+                if (bits := header(file).bits) > 8:
+                    raise ImageError(f"{file}: it has {bits} bits a channel")
                 scored = score_file(file, view, masked=masked)
             except ImageError as error:
                 wanted = f"an 8-bit RGB PNG of {view.width} x {view.height} px"

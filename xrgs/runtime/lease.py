@@ -11,10 +11,11 @@ seconds. It never creates or replaces a file: where another process has taken ov
 nothing is disturbed.
 
 An owner in the same place (host name, boot and process namespace) is alive as long as its process
-exists, suspended or not. An owner elsewhere, or one that has not signed its file yet, is alive
-while the file's date is less than `SILENT_S` seconds from now. Both times are the file server's, so
-that machines whose clocks differ do no harm. An owner that is cut off from the file server for so
-long loses its lease; it notices before it writes a result (`Lease.lost`).
+exists, suspended or not. An owner elsewhere is alive while the file's date is less than `SILENT_S`
+seconds from now, and one that has not signed its file yet while it is less than `UNSIGNED_S`. Both
+times are the file server's, so that machines whose clocks differ do no harm. An owner that is cut
+off from the file server for so long loses its lease; it notices before it writes a result
+(`Lease.lost`).
 """
 
 from __future__ import annotations
@@ -43,6 +44,9 @@ _log = logging.getLogger(__name__)
 BEAT_S = 30.0
 #: An owner on another machine is dead after this many seconds without a heartbeat.
 SILENT_S = 600.0
+#: A file that is empty for this many seconds is of an owner that was killed before it signed, which
+#: takes milliseconds. An owner that was only suspended finds out that it has lost its lease.
+UNSIGNED_S = 60.0
 #: Seconds between two tries of `waited_for`.
 _POLL_S = 0.5
 #: The most bytes of a lease's file that are read.
@@ -242,7 +246,7 @@ def _state(file: Path) -> _State:
     owner = _parse(content)
     if owner is None or not owner.here:
         # A live owner mends a date far in the future with its next heartbeat.
-        alive = abs(_now(file.parent) - changed) < SILENT_S
+        alive = abs(_now(file.parent) - changed) < (SILENT_S if content else UNSIGNED_S)
         return _State.ALIVE if alive else _State.DEAD
     if owner.lives:
         return _State.ALIVE

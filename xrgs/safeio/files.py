@@ -65,10 +65,12 @@ def list_names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-def walk_files(folder: Path) -> Iterator[tuple[str, os.stat_result]]:
+def walk_files(folder: Path, *, hidden: bool = False) -> Iterator[tuple[str, os.stat_result]]:
     """Yield each file below a folder: its path from there, with `/`, and its status.
 
-    Links to folders are files here, so that no walk is endless.
+    Links to folders are files here, so that no walk is endless. Names that begin with a dot are
+    passed over unless `hidden`: the system makes and removes such files when it likes (`.nfs0123`
+    of a file that is removed while it is open on NFS, `.DS_Store`), and no result has such a name.
     """
     waiting = [""]
     while waiting:
@@ -76,6 +78,8 @@ def walk_files(folder: Path) -> Iterator[tuple[str, os.stat_result]]:
         with os.scandir(folder / inside) as entries:
             for entry in entries:
                 name = f"{inside}{entry.name}"
+                if entry.name.startswith(".") and not hidden:
+                    continue
                 if entry.is_dir(follow_symlinks=False):
                     waiting.append(f"{name}/")
                 else:
@@ -84,7 +88,9 @@ def walk_files(folder: Path) -> Iterator[tuple[str, os.stat_result]]:
 
 def file_bytes(path: Path) -> int:
     """Return the bytes of the regular files at a path and below."""
-    statuses = [status for _, status in walk_files(path)] if path.is_dir() else [path.lstat()]
+    statuses = [path.lstat()]
+    if path.is_dir():
+        statuses = [status for _, status in walk_files(path, hidden=True)]
     return sum(status.st_size for status in statuses if stat.S_ISREG(status.st_mode))
 
 

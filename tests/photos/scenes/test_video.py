@@ -74,11 +74,11 @@ def write_video(
         container.mux(stream.encode(None))
 
 
-def turn(file: Path) -> None:
-    """Write a quarter turn clockwise into the header of an MP4."""
+def turn(file: Path, matrix: bytes = QUARTER_TURN) -> None:
+    """Write a matrix, else a quarter turn clockwise, into the header of an MP4."""
     content = file.read_bytes()
     at = content.index(UPRIGHT, content.index(b"tkhd"))
-    file.write_bytes(content[:at] + QUARTER_TURN + content[at + len(UPRIGHT) :])
+    file.write_bytes(content[:at] + matrix + content[at + len(UPRIGHT) :])
 
 
 def patches(
@@ -135,6 +135,38 @@ def test_a_video_held_upright_is_turned_as_a_player_does(tmp_path: Path) -> None
     assert image.shape == (WIDTH, HEIGHT, 3)
     assert image[: WIDTH // 3].mean() * 255 == pytest.approx(200, abs=6)
     assert image[-WIDTH // 3 :].mean() * 255 < 100
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "c", "d"),
+    [
+        (1, 0, 0, 1),
+        (-1, 0, 0, 1),
+        (1, 0, 0, -1),
+        (-1, 0, 0, -1),
+        (0, 1, 1, 0),
+        (0, -1, 1, 0),
+        (0, 1, -1, 0),
+        (0, -1, -1, 0),
+    ],
+)
+def test_a_video_is_turned_and_mirrored_by_its_matrix(
+    tmp_path: Path, a: int, b: int, c: int, d: int
+) -> None:
+    """QuickTime's format shows the pixel (x, y) at (ax + cy, bx + dy), and moves it into view."""
+    frame = np.full((HEIGHT, WIDTH, 3), 60, np.uint8)
+    frame[: HEIGHT // 2, : WIDTH // 2] = 200
+    write_video(tmp_path / "a.mp4", [frame, frame])
+    values = (a, b, 0, c, d, 0, 0, 0, 1 << 14)
+    turn(tmp_path / "a.mp4", b"".join((v << 16).to_bytes(4, "big", signed=True) for v in values))
+    scene = scenes.resolve(conf(tmp_path / "a.mp4", 2), tmp_path)
+    image = images.read(scene.files["frame_0000"])
+    right, down = -a - c > 0, -b - d > 0  # the bright quarter is at the top left in the file
+    height, width = image.shape[:2]
+    assert (height, width) == ((WIDTH, HEIGHT) if b else (HEIGHT, WIDTH))
+    y, x = height * (1 + 2 * down) // 4, width * (1 + 2 * right) // 4
+    assert image[y, x].mean() * 255 == pytest.approx(200, abs=6)
+    assert image[height - y, width - x].mean() * 255 == pytest.approx(60, abs=6)
 
 
 @pytest.mark.parametrize(

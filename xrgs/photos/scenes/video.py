@@ -15,6 +15,7 @@ compares the lines of each frame with its neighbours, and marks those of two fie
 from __future__ import annotations
 
 import logging
+import struct
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
@@ -22,7 +23,7 @@ from functools import partial
 from importlib.util import find_spec
 from itertools import chain, groupby, islice, pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -274,8 +275,22 @@ def _shown(frame: _Frame) -> images.ImageArray:
         format="rgb24", src_colorspace="ITU709" if is_hd else None
     ).to_ndarray()
     image, _ = colour.convert(pixels, None, frame.encoding)
-    turned = np.rot90(images.resize(image, *frame.size), round(decoded.rotation / 90) % 4)
-    return np.ascontiguousarray(turned)
+    return np.ascontiguousarray(_upright(images.resize(image, *frame.size), decoded))
+
+
+def _upright(image: images.ImageArray, frame: VideoFrame) -> images.ImageArray:
+    """Turn and mirror an image by the matrix of its frame, to the nearest quarter turn.
+
+    The matrix begins with a, b, u, c, d in 32-bit integers: (x, y) is shown at (ax + cy, bx + dy),
+    with y down. PyAV's `rotation` has no mirroring.
+    """
+    matrix: Any = frame.side_data.get("DISPLAYMATRIX")
+    if matrix is None:
+        return image
+    a, b, _, c, d = struct.unpack_from("=5i", matrix)
+    if abs(b) > abs(a):
+        image, a, d = image.swapaxes(0, 1), c, b
+    return image[:: -1 if d < 0 else 1, :: -1 if a < 0 else 1]
 
 
 def deinterlaced(frames: Iterable[VideoFrame]) -> Iterator[VideoFrame]:
