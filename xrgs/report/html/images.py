@@ -48,7 +48,7 @@ _WITH_ERROR_MAPS = 1.25
 
 
 #: The most runs with training views and models.
-_MAX_RUNS = 12
+_MAX_TRAINED = 12
 #: The most Gaussians of a model, for weak graphics processors, and the fewest that show a scene.
 _MAX_KEPT, _MIN_KEPT = 100_000, 8_000
 
@@ -254,7 +254,7 @@ def add_trained(
     first: dict[tuple[str, str], pd.DataFrame] = {}
     for rows in of_runs:
         first.setdefault((rows["scene"].iloc[0], rows["condition"].iloc[0]), rows)
-    chosen = list(islice(first.values(), _MAX_RUNS))
+    chosen = list(islice(first.values(), _MAX_TRAINED))
     if len(chosen) < len(first):
         content.notes.append(
             f"Training views and models are of {len(chosen)} of {len(first)} scenes and conditions."
