@@ -13,7 +13,8 @@
 # Matters:   the same photographs give other points and cameras, once in 15 to 90 runs of a loaded machine
 #            with 2 cores. FeatureMatchingOptions.num_threads = 1 avoids it.
 # Seen:      64 features in each of 300 images, 44,850 pairs: 0 with fewer than 64 matches on 1 thread, 6 and 2
-#            in two passes on 8 threads (37 to 48 matches are left), 2 and 1 on 2 threads
+#            in two passes on 8 threads (37 to 48 matches are left), 2 and 1 on 2 threads, while other programs ran;
+#            79 on 8 threads of two idle cores (24 to 63 are left)
 set -euo pipefail
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT

@@ -108,8 +108,8 @@ def test_any_number_of_threads_gives_the_same_bits(
 ) -> None:
     """Other draws of RANSAC move a camera by 0.036% of the scene, another order by 0.17%.
 
-    One thread matches: on several, pycolmap 4.2.1 loses matches in up to 7 of 44,850 pairs
-    (`findings/pycolmap_matcher_threads.sh`), too seldom for a test to see.
+    One thread matches: on several, pycolmap 4.2.1 loses matches in up to 79 of 44,850 pairs
+    (`findings/pycolmap_matcher_threads.sh`), too seldom for this test to see.
     """
     match, matching = pycolmap.match_image_pairs, set()
 
