@@ -88,7 +88,9 @@ def test_formulas_are_mathml(hooks: ModuleType) -> None:
 
 def test_links_lead_to_the_places_of_the_files_of_the_repository(hooks: ModuleType) -> None:
     """README.md is the home page; notes of studies are part of the site."""
-    assert "](reports/recipes/NOTES.md#" in on_page(hooks, "README.md")
+    page = on_page(hooks, "README.md")
+    assert "](reports/rivals/NOTES.md)" in page
+    assert re.search(r"\]\(\S*start\.md#your-photographs\)", page)
     assert re.search(r"\]\(conf/config\.md(#\S+)?\)", on_page(hooks, "docs/study.md"))
 
 
