@@ -105,12 +105,10 @@ def rescore(
             if not stale_scores(status.scored_by, added):
                 current += 1
                 continue
-            if (held := lease.acquire(store.leases, cell.id)) is None:
-                raise StoreError("a sweep is training it")
-            try:
+            with lease.held(store.leases, cell.id) as held:
+                if held is None:
+                    raise StoreError("a sweep is training it")
                 _score(cell, added)
-            finally:
-                held.release()
             scored += 1
         except XrgsError as error:
             left.append(f"left: {cell.id}: {error}")

@@ -519,14 +519,10 @@ def _hand_over(cell: PlannedCell, threads: int, store: Store) -> list[str]:
         variant=replace(variant, poses=poses),
     )
     # Under the lease: since the plan, another sweep may have begun or finished the cell.
-    cell_lease = lease.acquire(store.leases, cell.cell_id)
-    if cell_lease is not None:
-        try:
-            state = store.cell(cell.cell_id).state(verify=False)
-            if state.name != "done" and not state.unreadable:
-                plan_cell(store.cell(cell.cell_id), conf, cell.identity)
-        finally:
-            cell_lease.release()
+    with lease.held(store.leases, cell.cell_id) as held:
+        state = store.cell(cell.cell_id).state(verify=False)
+        if held is not None and state.name != "done" and not state.unreadable:
+            plan_cell(store.cell(cell.cell_id), conf, cell.identity)
     return [f"cell={cell.cell_id}", f"store={home}", f"name={cell.name}"]
 
 
@@ -561,8 +557,8 @@ def _tidy(done: set[str], store: Store) -> None:
         for cell_id in done:
             store.cell(cell_id).drop_checkpoint()
         for cell_id in done & lease.names(store.leases):
-            if (cell_lease := lease.acquire(store.leases, cell_id)) is not None:
-                cell_lease.release()
+            with lease.held(store.leases, cell_id):
+                pass
 
 
 def _without_reference(cell: PlannedCell) -> PlannedCell:
