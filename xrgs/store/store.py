@@ -8,7 +8,9 @@ described in `xrgs.store.cell_folder`.
 from __future__ import annotations
 
 import stat
+from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -200,13 +202,37 @@ class Store:
         """
         self.check_exists()
         records = self._records_or_warnings() if records is None else records
-        holders = lease.holders(self.leases)
-        return listing.cell_rows(self.cell_folders(), records, holders, verify=verify)
+        recorded, holders = listing.latest_records(records), lease.holders(self.leases)
+        sweeps: dict[str | None, list[str]] = {}
+        for sweep_id, record in records.items():
+            for cell_id in {row.cell_id for row in record.cells}:
+                sweeps.setdefault(cell_id, []).append(sweep_id)
+        rows = []
+        for cell in self.cell_folders():
+            state = cell.state(verify=verify, owner=holders.get(cell.id))
+            identity = None
+            with suppress(StoreError):
+                identity = cell.identity()
+            sweep_ids = tuple(sweeps.get(cell.id, ()))
+            rows.append(CellRow(cell, state, recorded.get(cell.id), sweep_ids, identity))
+        return sorted(rows, key=lambda row: (row.scene, row.arm, row.seed or 0, row.id))
 
     def sweep_rows(self) -> list[SweepRow]:
         """List the recorded sweeps, the latest last; raises as `cell_rows`."""
         records = self._records_or_warnings()
-        return listing.sweep_rows(self.sweeps, records, self.cell_rows(records))
+        not_ended = {"absent", "planned", "unfinished"}
+        states: dict[str | None, str] = {
+            row.id: row.state.name
+            for row in self.cell_rows(records)
+            if row.state.name not in not_ended
+        }
+        rows = []
+        for name, record in records.items():
+            cells = record.cells
+            of = ("failed" if row.error else states.get(row.cell_id, "pending") for row in cells)
+            when = modified(self.sweeps / f"{name}.json")
+            rows.append(SweepRow(name, record, when, Counter(of)))
+        return rows
 
     def cell_names(self) -> dict[str, RecordedCell]:
         """Return the row of the latest sweep that has each recorded cell, by the cell's id."""
