@@ -97,8 +97,6 @@ def rescore(
     scored, current, left = 0, 0, list[str]()
     for cell in progress(cells, "scoring", "cell", len(cells)):
         try:
-            if not cell.status_file.exists():
-                raise StoreError("it is not done")
             status = cell.status()
             if status.state != "done":
                 raise StoreError(f"it failed: {status.reason}")

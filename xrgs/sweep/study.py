@@ -24,6 +24,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from itertools import chain, count
 from pathlib import Path
 from typing import Any, cast
 
@@ -486,19 +487,16 @@ def _create_unique(preferred: Path, store: Store) -> Path:
         above = preferred.parent
         if not above.is_relative_to(home) or home.is_dir():
             above.mkdir(parents=True, exist_ok=True)
-        folder, number = preferred, 1
-        while True:
-            try:
+        later = (preferred.with_name(f"{preferred.name}-{number}") for number in count(2))
+        for folder in chain([preferred], later):
+            with suppress(FileExistsError):
                 folder.mkdir()
-            except FileExistsError:
-                number += 1
-                folder = preferred.with_name(f"{preferred.name}-{number}")
-            else:
-                return folder
+                break
     except OSError as error:
         if unwritable(error):
             raise
         raise XrgsError(f"hydra.sweep.dir={preferred}: {error}") from error
+    return folder
 
 
 def _hand_over(cell: PlannedCell, threads: int, store: Store) -> list[str]:
