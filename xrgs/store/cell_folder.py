@@ -355,17 +355,11 @@ class CellFolder:
         """Return the training history, one row per logged step; only `view` is text."""
         import pandas as pd
 
-        file = self.path / HISTORY
-        header, rows = read_table(file)
+        header, rows = read_table(self.path / HISTORY)
         table = pd.DataFrame(rows, columns=header, dtype=object)
-        try:
-            for name in header:
-                if name != "view":
-                    numbers = table[name].map(as_number).astype(float)
-                    whole = numbers.map(float.is_integer).all()
-                    table[name] = numbers.astype(int) if whole else numbers
-        except ValueError as error:
-            raise StoreError(f"damaged: {file}: {name}: {error}") from error
+        for name, values in number_columns(self.path / HISTORY).items():
+            is_whole = all(map(float.is_integer, values))
+            table[name] = pd.Series(values, dtype=int if is_whole else float)
         return table
 
     def gaussians(self) -> Gaussians:
@@ -415,11 +409,14 @@ def number_columns(file: Path) -> dict[str, list[float]]:
     StoreError says that the file is missing or damaged, or that a value is not a number.
     """
     header, rows = read_table(file)
-    places = [(place, name) for place, name in enumerate(header) if name != "view"]
+    columns = {}
     try:
-        return {name: [as_number(row[place]) for row in rows] for place, name in places}
+        for place, name in enumerate(header):
+            if name != "view":
+                columns[name] = [as_number(row[place]) for row in rows]
     except ValueError as error:
-        raise StoreError(f"damaged: {file}: {error}") from error
+        raise StoreError(f"damaged: {file}: {name}: {error}") from error
+    return columns
 
 
 def _is_heavy(name: str) -> bool:

@@ -147,15 +147,11 @@ class Store:
 
     def cell(self, cell_id: str) -> CellFolder:
         """Return the folder of a cell, which need not exist; StoreError if its id is no name."""
-        if not is_name(cell_id):
-            raise StoreError(f"{cell_id!r:.80} is not the id of a cell")
-        return CellFolder(self.cells_folder / cell_id)
+        return CellFolder(self.cells_folder / _checked(cell_id, "cell"))
 
     def variant(self, variant_id: str) -> Path:
         """Return the folder of a variant, which need not exist; see `cell`."""
-        if not is_name(variant_id):
-            raise StoreError(f"{variant_id!r:.80} is not the id of a variant")
-        return self.variants / variant_id
+        return self.variants / _checked(variant_id, "variant")
 
     def cells(self, *, verify: bool = True) -> pd.DataFrame:
         """List the cells: their names, configs, states and scores.
@@ -368,10 +364,8 @@ class Store:
 
     def sweep_record(self, sweep_id: str | None = None) -> SweepRecord:
         """Return the record of a sweep; None for the latest."""
-        sweep_id = sweep_id or self.latest_sweep()
-        if not is_name(sweep_id):
-            raise StoreError(f"{sweep_id!r:.80} is not the id of a sweep")
-        return read_struct(self.sweeps / f"{sweep_id}.json", SweepRecord, _MAX_RECORD_BYTES)
+        name = _checked(sweep_id or self.latest_sweep(), "sweep")
+        return read_struct(self.sweeps / f"{name}.json", SweepRecord, _MAX_RECORD_BYTES)
 
 
 def unchanged_record(file: Path) -> SweepRecord:
@@ -380,6 +374,13 @@ def unchanged_record(file: Path) -> SweepRecord:
     if digest(msgspec.to_builtins(record.cells)) != record.digest:
         raise StoreError(f"{file}: its cells have changed since it was written")
     return record
+
+
+def _checked(name: str, kind: str) -> str:
+    """Return an id, which must be a name."""
+    if not is_name(name):
+        raise StoreError(f"{name!r:.80} is not the id of a {kind}")
+    return name
 
 
 def _name_of(word: str) -> str:
