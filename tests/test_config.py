@@ -469,9 +469,8 @@ def test_an_identity_has_what_is_on(compose: Compose) -> None:
 
 @given(text=texts)
 def test_omegaconf_takes_an_escaped_text_literally(text: str) -> None:
-    nested = {"a": [text, {"b": text}], "c": 1, "d": None}
-    conf = OmegaConf.create(escape_interpolations(nested))
-    assert OmegaConf.to_container(conf, resolve=True) == nested
+    conf = OmegaConf.create({"a": escape_interpolations(text)})
+    assert OmegaConf.to_container(conf, resolve=True) == {"a": text}
 
 
 @pytest.mark.parametrize(

@@ -267,22 +267,9 @@ def _missing(values: Any, schema: Any, path: str = "") -> Iterator[tuple[Any, st
             yield values, name, f"{path}{name}"
 
 
-def escape_interpolations(value: Any) -> Any:
-    r"""Escape `${` in texts, so that OmegaConf takes them literally.
-
-    Args:
-        value: A text, or any nesting of dicts and lists of values.
-
-    Returns:
-        The value with each `${` replaced by `\${`, and the backslashes before it doubled.
-    """
-    if isinstance(value, dict):
-        return {name: escape_interpolations(inner) for name, inner in value.items()}
-    if isinstance(value, list):
-        return [escape_interpolations(inner) for inner in value]
-    if not isinstance(value, str):
-        return value
-    return _INTERPOLATION.sub(lambda match: 2 * match[1] + r"\${", value)
+def escape_interpolations(text: str) -> str:
+    r"""Write each `${` as `\${`, with twice the backslashes before it, so that it is no key."""
+    return _INTERPOLATION.sub(lambda match: 2 * match[1] + r"\${", text)
 
 
 def from_file(file: Path) -> tuple[Conf, dict[str, Any]]:

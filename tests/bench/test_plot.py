@@ -60,7 +60,7 @@ def widths(axes: Axes) -> list[float]:
 
 @pytest.mark.slow
 def test_one_panel_answers_each_question(results: dict[str, Any]) -> None:
-    backends, cutoffs, shortcuts, by_gaussians, by_pixels, steps = plot.draw_figure(results).axes
+    backends, cutoffs, shortcuts, by_gaussians, by_pixels, steps = plot.draw(results).axes
     # The largest load that torch was timed on, and one thread.
     drawn = points(backends)
     assert drawn["native"] == [[1e-7, 160.0]]
@@ -79,4 +79,4 @@ def test_one_panel_answers_each_question(results: dict[str, Any]) -> None:
 
 def test_a_single_load_shows_no_growth(results: dict[str, Any]) -> None:
     results["rows"], results["growth"] = results["rows"][:8], []
-    assert len(plot.draw_figure(results).axes) == 4
+    assert len(plot.draw(results).axes) == 4

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from matplotlib.figure import Figure
 
 from xrgs.bench import plot, rendering, run
 from xrgs.bench.settings import Settings
@@ -102,7 +103,7 @@ def test_the_files_hold_the_results(smoke: Smoke) -> None:
 
 @pytest.mark.slow
 def test_a_file_is_timed(file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(plot, "draw", lambda _: b"")  # half of the time
+    monkeypatch.setattr(plot, "draw", lambda _: Figure())  # half of the time
     settings = Settings(load=file, out=tmp_path / "o", json=tmp_path / "a.json")
     settings.repeats = settings.threads = 1
     text = run.run(settings)

@@ -73,8 +73,6 @@ def test_the_list_tells_states_and_old_code_and_sorts(store: Store) -> None:
     (old,) = [line for line in lines if line[:1] == ["old3"]]
     assert old[1:9] == ["motorcycle", "?", "0", "done", "(old", "code)", "3", "d"]
     assert list_cells(store.cell_rows(), "age").splitlines()[-1].startswith("old3")
-    with pytest.raises(XrgsError, match="sort=colour"):
-        list_cells(store.cell_rows(), "colour")
 
 
 def test_sweeps_are_listed_with_what_is_done(store: Store, cells: Any) -> None:

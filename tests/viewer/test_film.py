@@ -100,7 +100,6 @@ def test_a_film_that_fails_leaves_the_old_one(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"path": "loop"}, "path=loop: must be one of orbit, training, spiral, test"),
         ({"views": 0}, "views=0: must be from 1 to 100000"),
         ({"fps": 0}, "fps=0: must be from 1 to 240"),
         ({"size": (33, 32)}, "size=33x32: must be even numbers from 16 to 8192"),

@@ -52,10 +52,10 @@ def test_a_cell_is_found_by_its_scene_where_one_is_done(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "photos/garden/images").mkdir(parents=True)
     for word in ("garden", "photos/garden", "photos/garden/", "photos/garden/images"):
-        assert models.find_cell(word, store).id == "abc1"
-    assert models.find_cell("my bike", store).id == "abd2"
+        assert store.find_cell(word).id == "abc1"
+    assert store.find_cell("my bike").id == "abd2"
     (store.cell("abd2").path / "identity.json").write_text("{}")
-    assert models.find_cell(str(store.cell("abd2").path), Store("gone")).id == "abd2"
+    assert Store("gone").find_cell(str(store.cell("abd2").path)).id == "abd2"
     assert store.find_folder("garden") == store.cell("abc1").path
     assert [row.id for row in Filter(("garden",), store=store.path).chosen()[1]] == ["abc1"]
     for word in (sweep, sweep[:6], "my bike", "photos/garden"):
@@ -87,9 +87,9 @@ def test_a_word_that_names_no_finished_cell_is_refused(
     store: Store, word: str, message: str
 ) -> None:
     with pytest.raises(StoreError) as caught:
-        models.find_cell(word, store)
+        models.load_models([word], store)
     assert str(caught.value).startswith(message.format(cells=store.cells_folder))
-    assert models.find_cell("abc", store).id == "abc1"
+    assert store.find_cell("abc").id == "abc1"
 
 
 def test_a_ply_file_has_the_default_settings(

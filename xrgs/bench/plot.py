@@ -16,7 +16,6 @@ from matplotlib.ticker import NullFormatter
 from xrgs.bench.rendering import ALL_LOADS, TORCH_FLOAT64, total_ms
 from xrgs.bench.timing import Row
 from xrgs.bench.training import STEP_PARTS
-from xrgs.report.figures import png
 
 _DPI = 150
 _SIZE = (4.6, 4.2)  # of a panel, inches
@@ -25,17 +24,11 @@ _ROOM = 0.6  # beside bars for the legend, as a fraction of the longest bar
 _TIME = "forward + backward, ms"
 
 
-def draw(results: Mapping[str, Any]) -> bytes:
-    """Draw the plot of the results of `xrgs.bench.run`, with a panel for each question.
+def draw(results: Mapping[str, Any]) -> Figure:
+    """Plot the results of `xrgs.bench.run`, with a panel for each question.
 
-    Returns:
-        The bytes of a PNG.
+    All panels except that of training steps are for one thread.
     """
-    return png(draw_figure(results))
-
-
-def draw_figure(results: Mapping[str, Any]) -> Figure:
-    """Make the figure of `draw`. All panels except that of training steps are for one thread."""
     rows = [row for row in results["rows"] if row["threads"] == 1]
     load = largest_common_load(rows)
     first_method = rows[0]["method"]

@@ -9,6 +9,7 @@ import msgspec
 
 from xrgs.bench import against, loads, plot, rendering, tables, training
 from xrgs.errors import XrgsError
+from xrgs.report.figures import png
 from xrgs.runtime.machine import usable_cores
 from xrgs.runtime.progress import progress
 from xrgs.safeio.atomic import atomic_writer, write_json
@@ -87,7 +88,7 @@ def run(settings: Settings) -> str:
     files = {
         "bench.csv": _csv(results["rows"]),
         "shortcuts.csv": _csv(results["shortcuts"] + results["step_shortcuts"]),
-        "bench.png": plot.draw(results),
+        "bench.png": png(plot.draw(results)),
     }
     _write(files, results, settings)
     return tables.text(results)

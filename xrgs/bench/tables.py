@@ -11,7 +11,8 @@ from xrgs.bench.timing import Row
 from xrgs.runtime.text import padded
 
 # Columns of each table: heading -> format string for the values of a row.
-_SIZES = {"threads": "{threads}", "Gaussians": "{gaussians}", "size": "{width}x{height}"}
+_LOAD = {"Gaussians": "{gaussians}", "size": "{width}x{height}"}
+_SIZES = {"threads": "{threads}", **_LOAD}
 _RENDERS = {
     "method": "{method}",
     **_SIZES,
@@ -44,8 +45,7 @@ _STEPS = {
 }
 _SHORTCUTS = {
     "shortcut": "{shortcut}",
-    "Gaussians": "{gaussians}",
-    "size": "{width}x{height}",
+    **_LOAD,
     "forward ms on": "{on_forward_ms:.1f}",
     "forward ms off": "{off_forward_ms:.1f}",
     "backward ms on": "{on_backward_ms:.1f}",
@@ -60,8 +60,7 @@ _SHORTCUTS = {
 _STEP_SHORTCUTS = {
     "shortcut": "{shortcut}",
     "part": "{part}",
-    "Gaussians": "{gaussians}",
-    "size": "{width}x{height}",
+    **_LOAD,
     "ms on": "{on_ms:.2f}",
     "ms off": "{off_ms:.2f}",
     "off / on": "{times:.2f}x",

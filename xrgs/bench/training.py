@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import math
-import subprocess
-import sys
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -201,13 +200,10 @@ def measure_memory(backend: str, gaussians: int, width: int, height: int, thread
         the renderer's buffers; `base_rss_mib`, resident memory before training; `peak_rss_mib`, its
         maximum; and `growth_mib`, their difference. Without /proc there is only `counted_mib`.
     """
-    # A new process, since this one has already allocated memory for other loads. -P: does not
-    # import a checkout in the current folder.
-    arguments = [str(value) for value in (backend, gaussians, width, height, threads)]
-    command = [sys.executable, "-P", "-m", "xrgs.bench.training", *arguments]
-    done = subprocess.run(command, check=True, stdout=subprocess.PIPE)  # noqa: S603
-    row: Row = json.loads(done.stdout)
-    return row
+    # A new process, since this one has already allocated memory for other loads.
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+        sizes = (gaussians, width, height)
+        return pool.submit(_memory_of_this_process, backend, *sizes, threads).result()
 
 
 def _memory_of_this_process(
@@ -241,8 +237,3 @@ def _resident_mib() -> tuple[float, float]:
     lines = dict(line.split(":", 1) for line in _PROCESS_STATUS.read_text("ascii").splitlines())
     current, peak = (int(lines[key].split()[0]) / 1024 for key in ("VmRSS", "VmHWM"))
     return current, peak
-
-
-if __name__ == "__main__":
-    chosen, *numbers = sys.argv[1:]
-    sys.stdout.write(json.dumps(_memory_of_this_process(chosen, *map(int, numbers))))

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from dataclasses import is_dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias, TypeVar, get_type_hints
+from typing import Annotated, Any, TypeAlias, get_type_hints
 
 import tyro
 from tyro.conf import (
@@ -59,20 +59,20 @@ _CONFIG = (
     OmitArgPrefixes,  # --scenes, not --which.scenes, for an option in a dataclass
 )
 _REGISTRY = ConstructorRegistry()
-_Value = TypeVar("_Value")
 
 
 @_REGISTRY.primitive_rule
-def _path(kind: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Path] | None:
-    """Read a path, and expand `~`, which shells don't expand in `--out=~/a`."""
-    return _one_word(Path, "PATH", _given_path) if kind.type is Path else None
-
-
-@_REGISTRY.primitive_rule
-def _text(kind: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[str] | None:
-    """Read a text that is not empty."""
-    return (
-        _one_word(str, "TEXT", lambda word: _given_texts([word])[0]) if kind.type is str else None
+def _word(kind: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    """Read a text, or a path, whose `~` shells don't expand in `--out=~/a`; none may be empty."""
+    readers: dict[type, Callable[[list[str]], Any]] = {Path: _given_path, str: _given_text}
+    if kind.type not in readers:
+        return None
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="PATH" if kind.type is Path else "TEXT",
+        instance_from_str=readers[kind.type],
+        is_instance=lambda value: isinstance(value, kind.type),
+        str_from_instance=lambda value: [str(value)],
     )
 
 
@@ -91,18 +91,6 @@ def _texts(kind: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[tuple[str, ...]]
     )
 
 
-def _one_word(
-    kind: type[_Value], metavar: str, read: Callable[[str], _Value]
-) -> PrimitiveConstructorSpec[_Value]:
-    return PrimitiveConstructorSpec(
-        nargs=1,
-        metavar=metavar,
-        instance_from_str=lambda words: read(words[0]),
-        is_instance=lambda value: isinstance(value, kind),
-        str_from_instance=lambda value: [str(value)],
-    )
-
-
 def _given_texts(words: Sequence[str], least: int = 1) -> tuple[str, ...]:
     """Return the values of an option; ValueError for fewer than `least`, or an empty one.
 
@@ -113,11 +101,15 @@ def _given_texts(words: Sequence[str], least: int = 1) -> tuple[str, ...]:
     return tuple(words)
 
 
-def _given_path(text: str) -> Path:
+def _given_text(words: Sequence[str]) -> str:
+    return _given_texts(words)[0]
+
+
+def _given_path(words: Sequence[str]) -> Path:
     """Return the path of an option; ValueError for an empty one, as of an unset variable."""
-    if not text:
+    if not words[0]:
         raise ValueError("is empty; give a path, or leave the option out")
-    return user_path(text)
+    return user_path(words[0])
 
 
 def run(

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import hydra
 from omegaconf import MISSING, DictConfig, OmegaConf
@@ -182,8 +182,7 @@ def texts(words: Sequence[str]) -> DictConfig:
     conf = OmegaConf.create({})
     for word in words:
         key, _, value = word.partition("=")
-        text: Any = escape_interpolations(value)
-        OmegaConf.update(conf, key, text)
+        OmegaConf.update(conf, key, escape_interpolations(value))
     return conf
 
 

@@ -43,8 +43,8 @@ from xrgs.store.store import BASELINE
 _GROUP = ["label", "condition"]
 #: The units of the metrics that depend on the machine.
 _TIMES = frozenset({"s", "ms"})
-#: The columns in which a cell and its base must agree.
-_PAIR = ["scene", "condition", "variant_seed", "seed"]
+#: The keys of a run, which has a cell for each label: a cell and its base agree in them.
+RUN = ["scene", "condition", "variant_seed", "seed"]
 #: The columns of a pair that are computed of its two cells.
 _VALUES = ("base", "value", "effect", "why")
 
@@ -226,8 +226,8 @@ def _with_base(cells: pd.DataFrame, against: str) -> pd.DataFrame:
         raise ReportError(
             f"against={against}: the sweep has no such label; choose from: {', '.join(labels)}"
         )
-    bases = cells[cells["label"] == against].drop_duplicates(_PAIR).set_index(_PAIR)
-    base_id = cells[_PAIR].join(bases["cell_id"], on=_PAIR)["cell_id"]
+    bases = cells[cells["label"] == against].drop_duplicates(RUN).set_index(RUN)
+    base_id = cells[RUN].join(bases["cell_id"], on=RUN)["cell_id"]
     if against == BASELINE:
         base_id = cells["baseline_id"].where(cells["baseline_id"].notna(), base_id)
     base_id = base_id.where(cells["label"] != against, cells["cell_id"])

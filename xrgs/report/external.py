@@ -163,21 +163,16 @@ def _folder(program: External, cell: Mapping[Hashable, Any], done: pd.DataFrame)
     root, candidates = program.folder, []
     if is_inside(scene):
         candidates = [root / scene / str(draw)] + [root / scene] * (draws == 1)
-    if draws == 1 and set(done["scene"]) == {scene}:
-        candidates.append(root)
+    candidates += [root] * (draws == 1 and set(done["scene"]) == {scene})
     try:
-        existing = [folder for folder in candidates if folder.is_dir()]
+        for folder in candidates:
+            if folder.is_dir():
+                return folder
     except OSError as error:
-        raise ReportError(
-            f"external={program.label}: {program.folder}: {error.strerror}"
-        ) from error
-    if not existing:
-        expected = (
-            " or ".join(map(str, candidates))
-            or "a folder of the scene, though its name can't be a folder's name,"
-        )
-        raise ReportError(
-            f"external={program.label}: there are no renders of {scene} with variant.seed={draw}: "
-            f"{expected} is expected, with <view>.png for each view that is scored"
-        )
-    return existing[0]
+        raise ReportError(f"external={program.label}: {root}: {error.strerror}") from error
+    no_name = "a folder of the scene, though its name can't be a folder's name,"
+    raise ReportError(
+        f"external={program.label}: there are no renders of {scene} with variant.seed={draw}: "
+        f"{' or '.join(map(str, candidates)) or no_name} is expected, with <view>.png for each"
+        " view that is scored"
+    )

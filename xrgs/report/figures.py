@@ -105,8 +105,7 @@ def side_by_side(
     height, width = panels[0].image.shape[:2]
     cut_ratio = (rows.stop - rows.start) / (columns.stop - columns.start)
     ratios = [height / width, cut_ratio]
-    figure = _figure(_PANEL * len(panels), _PANEL * sum(ratios) + 1.1)
-    figure.suptitle(for_line(title, MAX_CELL), fontsize=11)
+    figure = _figure(title, _PANEL * len(panels), _PANEL * sum(ratios) + 1.1)
     figure.supxlabel(
         for_line(f"framed, and enlarged in the second row: {note}", MAX_CELL), fontsize=9
     )
@@ -132,8 +131,7 @@ def curves(
 
     A line of it is a run; the runs are the baseline's label and history, then the ablation's.
     """
-    figure = _figure(_PANEL * 1.5 * len(columns), _PANEL)
-    figure.suptitle(for_line(title, MAX_CELL), fontsize=11)
+    figure = _figure(title, _PANEL * 1.5 * len(columns), _PANEL)
     axes = figure.subplots(1, len(columns), squeeze=False)[0]
     styles = ({"color": _BASELINE}, {"color": _ABLATION, "linestyle": "--"})
     for axis, (column, name) in zip(axes, columns.items(), strict=True):
@@ -161,8 +159,7 @@ def quality_curves(
     `MAX_ARMS`, the baseline first), `scene`, `seconds`, `evaluations` and the scores of each
     evaluation; `means` has the same without `scene`.
     """
-    figure = _figure(_PANEL * 3 + 2.2, _PANEL * len(axes) + 0.6)
-    figure.suptitle(for_line(title, MAX_CELL), fontsize=11)
+    figure = _figure(title, _PANEL * 3 + 2.2, _PANEL * len(axes) + 0.6)
     panels = figure.subplots(len(axes), 2, squeeze=False, sharey="row", sharex="col")
     lines: dict[str, Line2D] = {}
     for row, metric in zip(panels, axes, strict=True):
@@ -226,8 +223,7 @@ def trade_off(
     label, the baseline first, with `gaussians` and the scores; `means` has the number of `scenes`,
     and `scenes` the name of each `scene`.
     """
-    figure = _figure(_PANEL * 1.1 * len(axes) + 2, max(_PANEL, 0.2 * len(means)))
-    figure.suptitle(for_line(title, MAX_CELL), fontsize=11)
+    figure = _figure(title, _PANEL * 1.1 * len(axes) + 2, max(_PANEL, 0.2 * len(means)))
     panels = figure.subplots(1, len(axes), squeeze=False)[0]
     for panel, metric in zip(panels, axes, strict=True):
         _dots(panel, means, scenes, metric.name)
@@ -282,8 +278,7 @@ def dependence(title: str, key: str, changes: pd.DataFrame, axes: Sequence[Metri
     scenes, and dots are its pairs. `changes` is the key's entry in `pictures.sensitivities`, of at
     most `MAX_ARMS - 1` series.
     """
-    figure = _figure(_PANEL * len(axes), _PANEL + 0.6)
-    figure.suptitle(for_line(title, MAX_CELL), fontsize=11)
+    figure = _figure(title, _PANEL * len(axes), _PANEL + 0.6)
     panels = figure.subplots(1, len(axes), squeeze=False)[0]
     series = list(dict.fromkeys(changes["series"]))
     for panel, metric in zip(panels, axes, strict=True):
@@ -328,9 +323,11 @@ def _with_grid(axis: Axes) -> None:
     axis.spines[["top", "right"]].set_visible(False)
 
 
-def _figure(width: float, height: float) -> Figure:
-    """Make an empty figure; its size is in inches."""
-    return Figure(figsize=(width, height), dpi=_DPI, layout="constrained")
+def _figure(title: str, width: float, height: float) -> Figure:
+    """Make a figure with a title; its size is in inches."""
+    figure = Figure(figsize=(width, height), dpi=_DPI, layout="constrained")
+    figure.suptitle(for_line(title, MAX_CELL), fontsize=11)
+    return figure
 
 
 def _show(axes: Axes, image: Image, interpolation: str) -> None:

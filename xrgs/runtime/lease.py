@@ -155,6 +155,17 @@ def acquire(folder: Path, name: str) -> Lease | None:
 
 
 @contextmanager
+def held(folder: Path, name: str) -> Iterator[Lease | None]:
+    """Hold a lease during a block; None where its owner is alive."""
+    lease = acquire(folder, name)
+    try:
+        yield lease
+    finally:
+        if lease is not None:
+            lease.release()
+
+
+@contextmanager
 def waited_for(folder: Path, name: str) -> Iterator[Lease]:
     """Hold a lease during a block, after waiting until its owner has released it or is dead."""
     warned = False

@@ -16,7 +16,9 @@ def hashes(folder: Path, names: Iterable[str]) -> dict[str, str]:
     return {name: file_digest(folder / name) for name in names}
 
 
-def changed(folder: Path, files: Mapping[str, str]) -> Iterator[StoreError]:
+def changed(
+    folder: Path, files: Mapping[str, str], since: str = "it was written"
+) -> Iterator[StoreError]:
     """Yield an error for each file of a folder that is missing or has changed.
 
     `files` has the SHA-256 that each must have, by its path in the folder, with `/`. The error is
@@ -26,7 +28,7 @@ def changed(folder: Path, files: Mapping[str, str]) -> Iterator[StoreError]:
         file = folder / name
         try:
             if file_digest(file) != expected:
-                yield StoreError(f"{file}: it has changed since it was written")
+                yield StoreError(f"{file}: it has changed since {since}")
         except OSError as error:
             kind = UnreadableError if is_transient(error) else StoreError
             yield kind(f"{file}: {error.strerror}")

@@ -18,6 +18,7 @@ import msgspec
 from xrgs.config import Conf
 from xrgs.errors import StoreError, UnreadableError
 from xrgs.runtime import progress
+from xrgs.safeio import checksums
 from xrgs.safeio.atomic import write_json, write_text
 from xrgs.safeio.files import is_name, is_transient, sync_tree, walk_files
 from xrgs.safeio.hashing import file_digest
@@ -188,28 +189,19 @@ class CellFolder:
         }
         try:
             status = self.status()
-            damage = [d for name, entry in status.files.items() if (d := self._damage(name, entry))]
-            listed = status.files.keys() | status.trimmed.keys() | NOT_RESULTS
-            damage += [
-                f"{self.path}/{name}: it does not belong there"
-                for name, _ in walk_files(self.path)
-                if name not in listed
+            hashes = {name: entry.sha256 for name, entry in status.files.items()}
+            damage = [
+                f"{error}; try again" if isinstance(error, UnreadableError) else str(error)
+                for error in checksums.changed(self.path, hashes, "the cell finished")
             ]
+            listed = status.files.keys() | status.trimmed.keys() | NOT_RESULTS
+            damage += map(str, checksums.unlisted(self.path, listed))
             for name in () if damage else decoders.keys() & status.files.keys():
                 decoders[name]()
         except (StoreError, OSError) as error:
             reason = CellState.of_error(error).reason.replace(f"{self.path}/", "")
             return [f"{self.path}: {reason}"]
         return damage
-
-    def _damage(self, name: str, entry: FileEntry) -> str:
-        """Say how a file differs from its entry; empty where it is intact."""
-        try:
-            intact = file_digest(self.path / name) == entry.sha256
-        except OSError as error:
-            again = "; try again" if is_transient(error) else ""
-            return f"{self.path}/{name}: {error.strerror}{again}"
-        return "" if intact else f"{self.path}/{name}: it has changed since the cell finished"
 
     # Ending a cell
 
@@ -363,17 +355,11 @@ class CellFolder:
         """Return the training history, one row per logged step; only `view` is text."""
         import pandas as pd
 
-        file = self.path / HISTORY
-        header, rows = read_table(file)
+        header, rows = read_table(self.path / HISTORY)
         table = pd.DataFrame(rows, columns=header, dtype=object)
-        try:
-            for name in header:
-                if name != "view":
-                    numbers = table[name].map(as_number).astype(float)
-                    whole = numbers.map(float.is_integer).all()
-                    table[name] = numbers.astype(int) if whole else numbers
-        except ValueError as error:
-            raise StoreError(f"damaged: {file}: {name}: {error}") from error
+        for name, values in number_columns(self.path / HISTORY).items():
+            is_whole = all(map(float.is_integer, values))
+            table[name] = pd.Series(values, dtype=int if is_whole else float)
         return table
 
     def gaussians(self) -> Gaussians:
@@ -423,11 +409,14 @@ def number_columns(file: Path) -> dict[str, list[float]]:
     StoreError says that the file is missing or damaged, or that a value is not a number.
     """
     header, rows = read_table(file)
-    places = [(place, name) for place, name in enumerate(header) if name != "view"]
+    columns = {}
     try:
-        return {name: [as_number(row[place]) for row in rows] for place, name in places}
+        for place, name in enumerate(header):
+            if name != "view":
+                columns[name] = [as_number(row[place]) for row in rows]
     except ValueError as error:
-        raise StoreError(f"damaged: {file}: {error}") from error
+        raise StoreError(f"damaged: {file}: {name}: {error}") from error
+    return columns
 
 
 def _is_heavy(name: str) -> bool:

@@ -44,11 +44,9 @@ def export(path: Path, layout: str, out: Path) -> str:
     views and points is returned.
 
     Raises:
-        XrgsError: The folder is not a finished cell or a variant, or is damaged; there is no such
-            layout; or `out` can't be written, or is not empty.
+        XrgsError: The folder is not a finished cell or a variant, or is damaged; or `out` can't be
+            written, or is not empty.
     """
-    if layout not in _LAYOUTS:
-        raise XrgsError(f"format={layout}: must be one of {', '.join(_LAYOUTS)}")
     from xrgs.formats.ply import save_ply
     from xrgs.mixture import variant
     from xrgs.training import dataset

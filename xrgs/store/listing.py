@@ -8,7 +8,6 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -135,30 +134,6 @@ def latest_records(records: Mapping[str, SweepRecord]) -> dict[str, RecordedCell
     return {row.cell_id: row for row in rows if row.cell_id is not None}
 
 
-def cell_rows(
-    cells: Iterable[CellFolder],
-    records: Mapping[str, SweepRecord],
-    holders: Mapping[str, str],
-    *,
-    verify: bool,
-) -> list[CellRow]:
-    """List cells as `Store.cell_rows`; `holders` describes the processes that train cells now."""
-    recorded = latest_records(records)
-    sweeps: dict[str | None, dict[str, None]] = {}
-    for sweep_id, record in records.items():
-        for cell_id in {row.cell_id for row in record.cells}:
-            sweeps.setdefault(cell_id, {})[sweep_id] = None
-    rows = []
-    for cell in cells:
-        state = cell.state(verify=verify, owner=holders.get(cell.id))
-        identity = None
-        with suppress(StoreError):
-            identity = cell.identity()
-        sweep_ids = tuple(sweeps.get(cell.id, ()))
-        rows.append(CellRow(cell, state, recorded.get(cell.id), sweep_ids, identity))
-    return sorted(rows, key=lambda row: (row.scene, row.arm, row.seed or 0, row.id))
-
-
 @dataclass(frozen=True)
 class SweepRow:
     """One recorded sweep of a store."""
@@ -169,24 +144,6 @@ class SweepRow:
     """When the record was written, in seconds since the epoch; None if unknown."""
     states: Counter[str]
     """The number of cells in each state; `pending` ones have not begun or not ended."""
-
-
-def sweep_rows(
-    folder: Path, records: Mapping[str, SweepRecord], cells: Iterable[CellRow]
-) -> list[SweepRow]:
-    """List recorded sweeps, the latest last, whose records are in a folder."""
-    states: dict[str | None, str] = {
-        cell.id: cell.state.name
-        for cell in cells
-        if cell.state.name not in {"absent", "planned", "unfinished"}
-    }
-    rows = []
-    for name, record in records.items():
-        of_cells = (
-            "failed" if row.error else states.get(row.cell_id, "pending") for row in record.cells
-        )
-        rows.append(SweepRow(name, record, modified(folder / f"{name}.json"), Counter(of_cells)))
-    return rows
 
 
 def modified(file: Path) -> float | None:

@@ -97,20 +97,16 @@ def rescore(
     scored, current, left = 0, 0, list[str]()
     for cell in progress(cells, "scoring", "cell", len(cells)):
         try:
-            if not cell.status_file.exists():
-                raise StoreError("it is not done")
             status = cell.status()
             if status.state != "done":
                 raise StoreError(f"it failed: {status.reason}")
             if not stale_scores(status.scored_by, added):
                 current += 1
                 continue
-            if (held := lease.acquire(store.leases, cell.id)) is None:
-                raise StoreError("a sweep is training it")
-            try:
+            with lease.held(store.leases, cell.id) as held:
+                if held is None:
+                    raise StoreError("a sweep is training it")
                 _score(cell, added)
-            finally:
-                held.release()
             scored += 1
         except XrgsError as error:
             left.append(f"left: {cell.id}: {error}")

@@ -8,7 +8,9 @@ described in `xrgs.store.cell_folder`.
 from __future__ import annotations
 
 import stat
+from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -145,15 +147,11 @@ class Store:
 
     def cell(self, cell_id: str) -> CellFolder:
         """Return the folder of a cell, which need not exist; StoreError if its id is no name."""
-        if not is_name(cell_id):
-            raise StoreError(f"{cell_id!r:.80} is not the id of a cell")
-        return CellFolder(self.cells_folder / cell_id)
+        return CellFolder(self.cells_folder / _checked(cell_id, "cell"))
 
     def variant(self, variant_id: str) -> Path:
         """Return the folder of a variant, which need not exist; see `cell`."""
-        if not is_name(variant_id):
-            raise StoreError(f"{variant_id!r:.80} is not the id of a variant")
-        return self.variants / variant_id
+        return self.variants / _checked(variant_id, "variant")
 
     def cells(self, *, verify: bool = True) -> pd.DataFrame:
         """List the cells: their names, configs, states and scores.
@@ -200,13 +198,37 @@ class Store:
         """
         self.check_exists()
         records = self._records_or_warnings() if records is None else records
-        holders = lease.holders(self.leases)
-        return listing.cell_rows(self.cell_folders(), records, holders, verify=verify)
+        recorded, holders = listing.latest_records(records), lease.holders(self.leases)
+        sweeps: dict[str | None, list[str]] = {}
+        for sweep_id, record in records.items():
+            for cell_id in {row.cell_id for row in record.cells}:
+                sweeps.setdefault(cell_id, []).append(sweep_id)
+        rows = []
+        for cell in self.cell_folders():
+            state = cell.state(verify=verify, owner=holders.get(cell.id))
+            identity = None
+            with suppress(StoreError):
+                identity = cell.identity()
+            sweep_ids = tuple(sweeps.get(cell.id, ()))
+            rows.append(CellRow(cell, state, recorded.get(cell.id), sweep_ids, identity))
+        return sorted(rows, key=lambda row: (row.scene, row.arm, row.seed or 0, row.id))
 
     def sweep_rows(self) -> list[SweepRow]:
         """List the recorded sweeps, the latest last; raises as `cell_rows`."""
         records = self._records_or_warnings()
-        return listing.sweep_rows(self.sweeps, records, self.cell_rows(records))
+        not_ended = {"absent", "planned", "unfinished"}
+        states: dict[str | None, str] = {
+            row.id: row.state.name
+            for row in self.cell_rows(records)
+            if row.state.name not in not_ended
+        }
+        rows = []
+        for name, record in records.items():
+            cells = record.cells
+            of = ("failed" if row.error else states.get(row.cell_id, "pending") for row in cells)
+            when = modified(self.sweeps / f"{name}.json")
+            rows.append(SweepRow(name, record, when, Counter(of)))
+        return rows
 
     def cell_names(self) -> dict[str, RecordedCell]:
         """Return the row of the latest sweep that has each recorded cell, by the cell's id."""
@@ -342,10 +364,8 @@ class Store:
 
     def sweep_record(self, sweep_id: str | None = None) -> SweepRecord:
         """Return the record of a sweep; None for the latest."""
-        sweep_id = sweep_id or self.latest_sweep()
-        if not is_name(sweep_id):
-            raise StoreError(f"{sweep_id!r:.80} is not the id of a sweep")
-        return read_struct(self.sweeps / f"{sweep_id}.json", SweepRecord, _MAX_RECORD_BYTES)
+        name = _checked(sweep_id or self.latest_sweep(), "sweep")
+        return read_struct(self.sweeps / f"{name}.json", SweepRecord, _MAX_RECORD_BYTES)
 
 
 def unchanged_record(file: Path) -> SweepRecord:
@@ -354,6 +374,13 @@ def unchanged_record(file: Path) -> SweepRecord:
     if digest(msgspec.to_builtins(record.cells)) != record.digest:
         raise StoreError(f"{file}: its cells have changed since it was written")
     return record
+
+
+def _checked(name: str, kind: str) -> str:
+    """Return an id, which must be a name."""
+    if not is_name(name):
+        raise StoreError(f"{name!r:.80} is not the id of a {kind}")
+    return name
 
 
 def _name_of(word: str) -> str:

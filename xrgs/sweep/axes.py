@@ -79,20 +79,11 @@ def expand(arguments: Sequence[str], loader: ConfigLoader | None = None) -> list
     swept = {key for key, values in axes.items() if len(values) > 1}
     specs: dict[CellSpec, None] = {}
     for combination in itertools.product(*axes.values()):
-        override_of = dict(zip(axes, combination, strict=True))
-        name_of = {key: key.lstrip("+~") for key in override_of}
-        shared = tuple(text for key, text in override_of.items() if not _is_change(name_of[key]))
-        changes = tuple(text for key, text in override_of.items() if _is_change(name_of[key]))
-        condition = " ".join(
-            override_of[key].lstrip("+")
-            for key in override_of
-            if key in swept and _is_condition(name_of[key])
-        )
-        label = _label(
-            (name_of[key], text.partition("=")[2])
-            for key, text in override_of.items()
-            if _is_change(name_of[key])
-        )
+        shared = tuple(text for text in combination if not _is_change(_name(text)))
+        changes = tuple(text for text in combination if _is_change(_name(text)))
+        of_axes = (text for key, text in zip(axes, combination, strict=True) if key in swept)
+        condition = " ".join(text.lstrip("+") for text in of_axes if _is_condition(_name(text)))
+        label = _label(changes)
         specs[CellSpec(BASELINE, condition, shared, ())] = None
         spec = CellSpec(label, condition, shared, changes)
         if label != BASELINE or spec.matched_to is not None:
@@ -132,14 +123,15 @@ def _is_condition(name: str) -> bool:
     return not _is_change(name) and group not in {"scene", "seed"} and name != "variant.seed"
 
 
-def _label(changes: Iterable[tuple[str, str]]) -> str:
-    """Return the changes as text; `xrgs.sweep.plan.planned` adds the reference of a count match."""
+def _label(changes: Iterable[str]) -> str:
+    """Return overrides as text; `xrgs.sweep.plan.planned` adds the reference of a count match."""
+    named = ((_name(text), text.partition("=")[2]) for text in changes)
     parts = [
         value.strip("[]").replace(",", "+").replace(" ", "").replace("'", "")
-        if key == "ablation"
-        else f"{key.removeprefix('components.')}={value}"
-        for key, value in changes
-        if key != "matched_to"
+        if name == "ablation"
+        else f"{name.removeprefix('components.')}={value}"
+        for name, value in named
+        if name != "matched_to"
     ]
     return " ".join(part for part in parts if part) or BASELINE
 

@@ -10,7 +10,7 @@ import re
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -164,19 +164,13 @@ def carry_out(store: Store, plan: Plan) -> tuple[int, list[str]]:
     """
     freed, left = 0, list[str]()
     for item in plan.items:
-        held = None
         try:
-            if item.lease and (held := lease.acquire(store.leases, item.lease)) is None:
-                why: str | None = "it is left: a sweep is training it"
-            else:
-                why = item.act()
+            with lease.held(store.leases, item.lease) if item.lease else nullcontext(True) as free:
+                why = item.act() if free else "it is left: a sweep is training it"
         except OSError as error:
             why = f"{error.filename}: {error.strerror}"
         except StoreError as error:
             why = str(error)
-        finally:
-            if held:
-                held.release()
         if why:
             left.append(for_line(f"{item.name}: {why}"))
         else:

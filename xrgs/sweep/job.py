@@ -252,11 +252,10 @@ def _run_under_lease(
         restore_images(conf, store, identity.variant)
     if not variant.is_dir():
         raise XrgsError(f"{name}: its variant {variant} is missing")
-    cell_lease = lease.acquire(store.leases, cell.id)
-    if cell_lease is None:
-        log_line(f"{cell.id}: another sweep is training this cell; this sweep leaves it")
-        return LOCKED
-    try:
+    with lease.held(store.leases, cell.id) as cell_lease:
+        if cell_lease is None:
+            log_line(f"{cell.id}: another sweep is training this cell; this sweep leaves it")
+            return LOCKED
         state = cell.state()
         if state.unreadable:
             log_line(f"{cell.id} is left: {state.reason}")
@@ -268,8 +267,6 @@ def _run_under_lease(
         if not session.brief:
             log_line(f"{name}: training cell {cell.id}")
         return _train_in_child(cell, conf, store, variant, cell_lease, session)
-    finally:
-        cell_lease.release()
 
 
 def _check_code(name: str, cell_id: str, conf: Conf, planned: Identity) -> None:
@@ -340,13 +337,10 @@ def _own_gpu(session: SweepSession, backend: str) -> Iterator[dict[str, str]]:
     folder, host = session.folder / "gpus", socket.gethostname()
     folder.mkdir(exist_ok=True)
     for name in cycle(names):
-        held = lease.acquire(folder, f"{host} {name}")
-        if held is not None:
-            try:
+        with lease.held(folder, f"{host} {name}") as free:
+            if free is not None:
                 yield {"CUDA_VISIBLE_DEVICES": name}
-            finally:
-                held.release()
-            return
+                return
         time.sleep(_GPU_POLL_S)
 
 

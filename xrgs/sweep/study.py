@@ -24,6 +24,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from itertools import chain, count
 from pathlib import Path
 from typing import Any, cast
 
@@ -486,19 +487,16 @@ def _create_unique(preferred: Path, store: Store) -> Path:
         above = preferred.parent
         if not above.is_relative_to(home) or home.is_dir():
             above.mkdir(parents=True, exist_ok=True)
-        folder, number = preferred, 1
-        while True:
-            try:
+        later = (preferred.with_name(f"{preferred.name}-{number}") for number in count(2))
+        for folder in chain([preferred], later):
+            with suppress(FileExistsError):
                 folder.mkdir()
-            except FileExistsError:
-                number += 1
-                folder = preferred.with_name(f"{preferred.name}-{number}")
-            else:
-                return folder
+                break
     except OSError as error:
         if unwritable(error):
             raise
         raise XrgsError(f"hydra.sweep.dir={preferred}: {error}") from error
+    return folder
 
 
 def _hand_over(cell: PlannedCell, threads: int, store: Store) -> list[str]:
@@ -519,14 +517,10 @@ def _hand_over(cell: PlannedCell, threads: int, store: Store) -> list[str]:
         variant=replace(variant, poses=poses),
     )
     # Under the lease: since the plan, another sweep may have begun or finished the cell.
-    cell_lease = lease.acquire(store.leases, cell.cell_id)
-    if cell_lease is not None:
-        try:
-            state = store.cell(cell.cell_id).state(verify=False)
-            if state.name != "done" and not state.unreadable:
-                plan_cell(store.cell(cell.cell_id), conf, cell.identity)
-        finally:
-            cell_lease.release()
+    with lease.held(store.leases, cell.cell_id) as held:
+        state = store.cell(cell.cell_id).state(verify=False)
+        if held is not None and state.name != "done" and not state.unreadable:
+            plan_cell(store.cell(cell.cell_id), conf, cell.identity)
     return [f"cell={cell.cell_id}", f"store={home}", f"name={cell.name}"]
 
 
@@ -561,8 +555,8 @@ def _tidy(done: set[str], store: Store) -> None:
         for cell_id in done:
             store.cell(cell_id).drop_checkpoint()
         for cell_id in done & lease.names(store.leases):
-            if (cell_lease := lease.acquire(store.leases, cell_id)) is not None:
-                cell_lease.release()
+            with lease.held(store.leases, cell_id):
+                pass
 
 
 def _without_reference(cell: PlannedCell) -> PlannedCell:

@@ -11,7 +11,6 @@ continues its run, and no step is there twice.
 
 from __future__ import annotations
 
-import csv
 import io
 import math
 import os
@@ -29,7 +28,7 @@ from xrgs.evaluation.metrics import METRICS
 from xrgs.photos import scenes
 from xrgs.runtime.progress import log_line
 from xrgs.safeio.atomic import write_json, write_text
-from xrgs.safeio.records import read_struct, read_table
+from xrgs.safeio.records import read_struct, read_table, table_text
 from xrgs.safeio.sanitize import for_csv, for_file_name, for_line
 from xrgs.store.cell_folder import HISTORY, STATUS, CellFolder, number_columns
 from xrgs.store.listing import modified
@@ -87,23 +86,20 @@ class _Table(Sink):
 
     def __init__(self, run: Run, folder: Path) -> None:
         self._file = folder / f"{run.name}.csv"
-        self._cell = [run.cell_id, *(for_csv(run.names[key]) for key in NAMES)]
-        self._rows: list[list[object]] = []
+        self._cell = {"cell_id": run.cell_id, **{key: for_csv(run.names[key]) for key in NAMES}}
+        self._rows: list[dict[str, Any]] = []
         if self._file.exists():
-            self._rows.extend([*row] for row in read_table(self._file)[1])
-        self.sent = max((int(str(row[-2])) for row in self._rows), default=-1)
+            header, rows = read_table(self._file)
+            self._rows += [dict(zip(header, row, strict=True)) for row in rows]
+        self.sent = max((int(row["step"]) for row in self._rows), default=-1)
 
     def send(self, new: Curves) -> None:
         self._rows += [
-            [*self._cell, for_csv(name), step, value]
+            {**self._cell, "series": for_csv(name), "step": step, "value": value}
             for step, values in new.items()
             for name, value in values.items()
         ]
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(["cell_id", *NAMES, "series", "step", "value"])
-        writer.writerows(self._rows)
-        write_text(self._file, text.getvalue(), durable=False)
+        write_text(self._file, table_text(self._rows), durable=False)
 
 
 class _Events(Sink):

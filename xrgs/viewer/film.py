@@ -58,7 +58,7 @@ def make_film(
         XrgsError: An argument is out of its range, no model has cameras, PyAV is missing, or `out`
             can't be written; the message names the argument.
     """
-    _check(path, views, fps, size)
+    _check(views, fps, size)
     is_film = _is_film(out)
     world = reference(models)
     if world is None or world.poses is None:
@@ -80,9 +80,7 @@ def make_film(
     return f"{out}: {counted(views, 'frame')} of {shown}{length}, path {path}"
 
 
-def _check(path: str | None, views: int, fps: int, size: tuple[int, int] | None) -> None:
-    if path is not None and path not in PATHS:
-        raise XrgsError(f"path={path}: must be one of {', '.join(PATHS)}")
+def _check(views: int, fps: int, size: tuple[int, int] | None) -> None:
     if not 1 <= views <= _MAX_FRAMES:
         raise XrgsError(f"views={views}: must be from 1 to {_MAX_FRAMES}")
     if not 1 <= fps <= 240:

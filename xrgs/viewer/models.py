@@ -16,7 +16,6 @@ from xrgs.safeio.sanitize import for_line
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import Gaussians
 from xrgs.splat.settings import RasterSettings
-from xrgs.store.cell_folder import CellFolder
 from xrgs.store.store import Store
 from xrgs.viewer.paths import Poses
 
@@ -83,17 +82,6 @@ def reference(models: Sequence[Model]) -> Model | None:
     return next((model for model in models if model.views), None)
 
 
-def find_cell(word: str, store: Store) -> CellFolder:
-    """Find a finished cell, see `Store.find_cell`.
-
-    Raises:
-        StoreError: There is no such store or cell, there are several, or it is not finished.
-    """
-    cell = store.find_cell(word)
-    cell.check_done(verify=False)
-    return cell
-
-
 def _with(model: Model, antialiased: bool | None) -> Model:
     if antialiased is None or antialiased == model.settings.antialiased:
         return model
@@ -114,7 +102,8 @@ def _load(word: str, store: Store) -> Model:
         settings = RasterSettings(antialiased=antialiased)
         return Model(for_line(file.name, _MAX_NAME), gaussians, settings)
     try:
-        cell = find_cell(word, store)
+        cell = store.find_cell(word)
+        cell.check_done(verify=False)
     except StoreError:
         check_is_read(file)
         raise

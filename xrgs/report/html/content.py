@@ -13,15 +13,12 @@ from xrgs.errors import StoreError
 from xrgs.evaluation.metrics import METRICS, VIEW_METRICS
 from xrgs.mixture.views import Variant
 from xrgs.report.collect import CURVE_COLUMNS, ReportStore, Sweep
-from xrgs.report.compare import Comparison
+from xrgs.report.compare import RUN, Comparison
 from xrgs.report.context import Context
 from xrgs.report.markup import titled
 from xrgs.report.writing import by_key, number, verdict, with_unit
 from xrgs.safeio.sanitize import MAX_CELL, counted, for_line
 from xrgs.store.cell_folder import HISTORY, number_columns
-
-#: The keys of a run. The page shows the cells of a run, one for each label, side by side.
-RUN = ["scene", "condition", "variant_seed", "seed"]
 
 
 @dataclass
