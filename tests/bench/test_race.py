@@ -1,20 +1,16 @@
-"""`benchmarks/race.py`: its plans, what it reads of OpenSplat, its statistics, and a whole race."""
+"""`benchmarks/race.py`: its plans, what it reads of OpenSplat, and its statistics."""
 
 from __future__ import annotations
 
-import csv
 import importlib
 import math
 import shutil
-import subprocess
-import sys
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 import pytest
 import torch
 from PIL import Image
@@ -27,7 +23,6 @@ from xrgs.splat.gaussians import Gaussians
 from xrgs.training.dataset import LoadedView
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
-STAND_IN = Path(__file__).with_name("opensplat_stand_in.py")
 
 
 @pytest.fixture
@@ -169,43 +164,3 @@ def test_a_pixel_without_gaussians_has_opensplats_background(race: Any, tmp_path
     background = np.broadcast_to(np.array([0.6130, 0.0101, 0.3984], np.float32), (24, 32, 3))
     expected = peak_signal_noise_ratio(photograph / 255, background, data_range=1)
     assert scores["psnr"] == pytest.approx(expected, rel=1e-6)
-
-
-@pytest.mark.exhaustive  # minutes, for a script outside the package
-def test_a_race_goes_on_where_it_was_stopped(tmp_path: Path) -> None:
-    peer = tmp_path / "opensplat"
-    peer.write_text(f'#!/bin/sh\nexec {sys.executable} {STAND_IN} "$@"\n')
-    peer.chmod(0o755)
-    command = [
-        *(sys.executable, str(BENCHMARKS / "race.py"), "race", "variant.sfm.long_side=500"),
-        *("--sizes", "250", "--scenes", "procedural", "--arms", "baseline"),
-        *("--probe-steps", "10", "--opensplat", str(peer)),
-    ]
-
-    def run(*minutes: str) -> list[dict[str, str]]:
-        words = [*command, "--minutes", *minutes]
-        done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stderr
-        with (tmp_path / "race" / "race.csv").open() as file:
-            return list(csv.DictReader(file))
-
-    first = run("0.05")
-    assert {row["arm"] for row in first} == {"baseline", "opensplat", "opensplat_planned"}
-    assert run("0.05") == first, "all budgets have their runs"
-    both = run("0.05", "0.1")
-    assert both[: len(first)] == first
-    folder = tmp_path / "race" / "opensplat" / "250"
-    images = pycolmap.Reconstruction(folder / "data" / "procedural" / "sparse" / "0").images
-    [variant] = (tmp_path / "race" / "store" / "variants").glob("*-*")
-    views = {f.stem for f in (variant / "images" / "train").iterdir()}
-    assert {image.name.removesuffix(".png") for image in images.values()} == views
-    row = next(row for row in both if row["arm"] == "opensplat" and row["minutes"] == "0.1")
-    assert 0 < float(row["seconds"]) <= 6
-    psnr = [
-        peak_signal_noise_ratio(
-            np.asarray(Image.open(variant / "images" / "test" / file.name)),
-            np.asarray(Image.open(file)),
-        )
-        for file in (folder / "opensplat-0.1min" / "procedural").glob("*.png")
-    ]
-    assert float(row["psnr"]) == pytest.approx(np.mean(psnr), abs=0.05)
