@@ -103,25 +103,6 @@ def test_16_bits_stay_16_through_a_profile(
     assert note == "converted from p to sRGB"
 
 
-def as_imagecms_gives(samples: NDArray[np.uint8], icc: bytes, mode: str) -> NDArray[np.uint8]:
-    converted = ImageCms.profileToProfile(
-        Image.fromarray(samples, mode),
-        ImageCms.ImageCmsProfile(io.BytesIO(icc)),
-        ImageCms.createProfile("sRGB"),
-        renderingIntent=ImageCms.Intent.RELATIVE_COLORIMETRIC,
-        outputMode="RGB",
-        flags=ImageCms.Flags.BLACKPOINTCOMPENSATION,
-    )
-    return np.asarray(converted)
-
-
-def test_8_bits_are_as_imagecms_gives_them(tmp_path: Path) -> None:
-    icc = profile("p", 1.8, ADOBE_RGB)
-    Image.fromarray(smooth()).save(tmp_path / "a.png", icc_profile=icc)
-    expected = as_imagecms_gives(smooth(), icc, "RGB")
-    assert np.array_equal(images.read(tmp_path / "a.png") * 255, expected)
-
-
 @pytest.mark.parametrize("suffix", ["png", "jpg", "tif"])
 def test_srgb_and_no_profile_are_the_same_bits(tmp_path: Path, suffix: str) -> None:
     plain, tagged = tmp_path / f"a.{suffix}", tmp_path / f"b.{suffix}"
@@ -163,14 +144,17 @@ def test_a_profile_that_cant_be_used_is_ignored(
     assert picture.notes == ((note,) if note else ())
 
 
-@pytest.mark.parametrize("suffix", ["jpg", "tif"])
-def test_cmyk_without_a_profile_is_said(tmp_path: Path, suffix: str) -> None:
-    cmyk = Image.fromarray(np.dstack([smooth(), smooth(1)[..., 0]]), "CMYK")
-    cmyk.save(tmp_path / f"a.{suffix}")
-    stored = Image.open(tmp_path / f"a.{suffix}")
-    assert stored.mode == "CMYK"
-    picture = images.decode(tmp_path / f"a.{suffix}")
-    assert np.array_equal(np.round(picture.pixels * 255), np.asarray(stored.convert("RGB")))
+@pytest.mark.parametrize("form", ["jpg", "tif", "tif of 16 bits"])
+def test_cmyk_without_a_profile_is_said(tmp_path: Path, form: str) -> None:
+    samples, file = np.dstack([smooth(), smooth(1)[..., 0]]), tmp_path / f"a.{form[:3]}"
+    stored = Image.fromarray(samples, "CMYK")
+    if form == "tif of 16 bits":
+        tifffile.imwrite(file, samples.astype(np.uint16) * 257, photometric="separated")
+    else:
+        stored.save(file)
+        stored = Image.open(file)
+    picture = images.decode(file)
+    assert np.abs(picture.pixels * 255 - np.asarray(stored.convert("RGB"))).max() < 0.6
     assert picture.notes == ("converted from CMYK without a profile",)
 
 
@@ -465,10 +449,3 @@ def test_heic_names_its_colours_by_number(tmp_path: Path, primaries: int, transf
     values = smooth() / 255
     assert np.abs(picture.pixels - (p3(values) if primaries == 12 else values)).max() < 0.1 / 255
     assert len(picture.notes) == (primaries == 12)
-
-
-def test_cmyk_of_16_bits_is_as_its_8_bits(tmp_path: Path) -> None:
-    samples = np.dstack([smooth(), smooth(1)[..., 0]])
-    tifffile.imwrite(tmp_path / "a.tif", samples.astype(np.uint16) * 257, photometric="separated")
-    plain = np.asarray(Image.fromarray(samples, "CMYK").convert("RGB")) / 255
-    assert np.abs(images.read(tmp_path / "a.tif") - plain).max() < 0.6 / 255

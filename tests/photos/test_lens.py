@@ -177,20 +177,3 @@ def test_a_strong_barrel_lens_does_not_fold_the_picture() -> None:
     source = corner * (1 - 0.9 * (corner**2).sum()) * 60 + (50, 40)
     assert (source >= 0).all()
     assert (source <= (W, H)).all()
-
-
-@pytest.mark.parametrize("model", SERVED)
-def test_a_distorted_checkerboard_is_straight_again(model: str) -> None:
-    """The board is rendered through pycolmap's inverse, which undistortion does not use."""
-
-    def board(rays: NDArray[np.float64]) -> NDArray[np.float32]:
-        waves = np.sin(12 * rays[..., 0]) * np.sin(12 * rays[..., 1])
-        return np.repeat((0.5 + 0.4 * waves)[..., None], 3, -1).astype(np.float32)
-
-    cam = camera(model, f=80.0)
-    rays = cam.cam_from_img(pixel_grid().reshape(-1, 2)).reshape(H, W, 2)
-    lens = lens_of(cam)
-    K = lens.undistorted().K
-    expected = board(rays_of(pixel_grid(), K)[..., :2])
-    error = np.abs(undistort(board(rays), lens) - expected)[2:-2, 2:-2]
-    assert error.max() < 0.01
