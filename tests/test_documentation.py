@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
+import xrgs
+
 ROOT = Path(__file__).parents[1]
 #: The target of a link or a picture; those of the web and of an address are not looked at.
 _LINK = re.compile(r"\]\((?!\w+:)([^)\s]+)\)")
@@ -102,3 +104,11 @@ def test_the_tested_versions_are_those_that_are_allowed() -> None:
     assert tested.keys() == allowed.keys()
     for name, versions in tested.items():
         assert all(allowed[name].contains(version) for version in versions), name
+
+
+def test_the_site_has_every_public_name_and_every_study() -> None:
+    api = (ROOT / "docs/api.md").read_text(encoding="utf-8")
+    assert all(f"\n::: xrgs.{name}\n" in api for name in xrgs.__all__)
+    studies = {str(file.relative_to(ROOT)) for file in ROOT.glob("reports/*/NOTES.md")}
+    navigation = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    assert set(re.findall(r"reports/\w+/NOTES\.md", navigation)) == studies
