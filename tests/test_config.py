@@ -204,25 +204,8 @@ def test_the_splat_librarys_defaults_are_the_baselines(group: str, compose: Comp
         ("splat.strategy=mcmc", "splat.densify.budget=0: must be "),
         ("+ablation=[mcmc,long_axis]", "splat.densify.split=long_axis: must be "),
         ("+ablation=[mcmc,absgrad]", "splat.raster.absgrad=True: must be "),
-        ("splat.optimizer.shN_every=0", "splat.optimizer.shN_every=0: must be at least"),
         ("threads=-1", "threads=-1: must be at least"),
         ("limits.minutes=nan", "limits.minutes=nan: must be at least"),
-        (
-            "splat.optimizer.means_decay_from=-1",
-            "splat.optimizer.means_decay_from=-1: must be at least 0 and below 30000",
-        ),
-        (
-            "splat.optimizer.length_decay_from=30000",
-            "splat.optimizer.length_decay_from=30000: must be at least 0 and below 30000",
-        ),
-        (
-            "splat.optimizer.length_power=1.5",
-            "splat.optimizer.length_power=1.5: must be at least 0 and at most 1",
-        ),
-        (
-            "splat.optimizer.length_power=nan",
-            "splat.optimizer.length_power=nan: must be at least 0 and at most 1",
-        ),
         ("train.validation=1", "train.validation=1.0: must be at least 0 and below 1"),
         ("train.hr_share=-0.1", "train.hr_share=-0.1: must be at least 0 and below 1"),
         ("splat.backend=cuda", "splat.backend=cuda: must be one of "),

@@ -41,8 +41,8 @@ def lens_of(cam: pycolmap.Camera) -> Lens:
     return lens_of_model(cam.model_name, (cam.width, cam.height), [float(p) for p in cam.params])
 
 
-def simple(k: float, f: float = 90.0) -> Lens:
-    return lens_of_model("SIMPLE_RADIAL", (W, H), [f, 48.0, 41.0, k])
+def simple(k: float) -> Lens:
+    return lens_of_model("SIMPLE_RADIAL", (W, H), [90.0, 48.0, 41.0, k])
 
 
 def pixel_grid(width: int = W, height: int = H) -> NDArray[np.float64]:

@@ -97,8 +97,8 @@ def test_a_folder_that_can_not_be_meant_is_refused(
         masks.find(str(tmp_path / "none"), {"a": Path("x")})
 
 
-def folder_scene(tmp_path: Path, count: int = 3) -> Any:
-    for number in range(count):
+def folder_scene(tmp_path: Path) -> Any:
+    for number in range(3):
         save(tmp_path / "photos" / f"{number}.png", noise((60, 40), number))
         save(tmp_path / "photos" / "m" / f"{number}.png", np.full((40, 60, 3), 255, np.uint8))
     return replace(
