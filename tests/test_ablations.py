@@ -62,22 +62,15 @@ def delta(conf: Conf, baseline: Conf) -> dict[str, Any]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ABLATIONS)
-def test_each_ablation_is_another_cell(name: str, composed: Compose) -> None:
-    baseline, ablation = composed(), composed(f"+ablation={name}")
-    if ablation.matched_to is not None:  # a sweep fills in that cell's number of Gaussians
-        ablation = composed(f"+ablation={name}", "components.count_matched.gaussians=1000")
-    assert cell_id(ablation) != cell_id(baseline)
-    changed = delta(ablation, baseline)
-    assert {key.split(".")[0] for key in changed} <= {"components", "splat", "train", "matched_to"}
-
-
-@pytest.mark.slow
-def test_no_two_ablations_are_the_same_cell(composed: Compose) -> None:
-    confs = [composed(f"+ablation={name}") for name in ABLATIONS]
-    # Two controls differ only in the cell whose number of Gaussians they have to reach.
-    assert len({(cell_id(conf), conf.matched_to) for conf in confs}) == len(ABLATIONS)
+def test_each_ablation_is_a_cell_of_its_own_and_changes_training_only(composed: Compose) -> None:
     assert cell_id(composed("+ablation=baseline")) == cell_id(composed())
+    # Two controls differ only in the cell whose number of Gaussians they have to reach.
+    cells = {(cell_id(composed()), None): "baseline"}
+    for name in ABLATIONS:
+        conf = composed(f"+ablation={name}")
+        assert cells.setdefault((cell_id(conf), conf.matched_to), name) == name
+        changed = {key.split(".")[0] for key in delta(conf, composed())}
+        assert changed <= {"components", "splat", "train", "matched_to"}, name
 
 
 @pytest.mark.slow
@@ -94,27 +87,6 @@ def test_each_value_of_a_sweep_file_makes_a_config(file: Path, composed: Compose
                 assert spec.matched_to is None or spec.matched_to in labels
             else:
                 composed(*spec.overrides)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("names", "whole"),
-    [
-        (("loss_weighting", "gradient_scaling"), "loss_gradient"),
-        (("loss_weighting", "gradient_scaling", "densify", "consistency"), "xrgs"),
-        (("xrgs", "mip"), None),
-        (("densify", "absgrad"), None),
-    ],
-)
-def test_ablations_can_be_combined(
-    names: tuple[str, ...], whole: str | None, composed: Compose
-) -> None:
-    baseline = composed()
-    layers = [delta(composed(f"+ablation={name}"), baseline) for name in names]
-    combined = composed(f"+ablation=[{','.join(names)}]")
-    assert delta(combined, baseline) == {key: v for layer in layers for key, v in layer.items()}
-    if whole is not None:
-        assert combined == composed(f"+ablation={whole}")
 
 
 @pytest.mark.slow
