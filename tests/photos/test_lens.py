@@ -56,12 +56,6 @@ def border() -> NDArray[np.float64]:
     return np.concatenate([np.stack(p, -1) for p in sides]) * (W, H)
 
 
-def rays_of(pixels: NDArray[np.float64], K: NDArray[np.float64]) -> NDArray[np.float64]:
-    flat = np.concatenate([pixels, np.ones((*pixels.shape[:-1], 1))], axis=-1)
-    rays: NDArray[np.float64] = flat @ np.linalg.inv(K).T
-    return rays
-
-
 def test_the_table_of_models_is_pycolmaps() -> None:
     members = pycolmap.CameraModelId.__members__
     ids = {name: int(value) for name, value in members.items() if name != "INVALID"}
@@ -105,7 +99,8 @@ def test_undistortion_reads_each_pixel_where_the_lens_projects_its_ray(
     if quarters:
         lens, image = lens.turned(quarters), np.ascontiguousarray(np.rot90(stored, -quarters))
     out, K = undistort(image, lens), lens.undistorted().K
-    rays = rays_of(pixel_grid(lens.width, lens.height), K)
+    grid = pixel_grid(lens.width, lens.height)
+    rays = np.concatenate([grid, np.ones((*grid.shape[:2], 1))], -1) @ np.linalg.inv(K).T
     rays[..., :2] = rays[..., :2] @ quarter_turn(quarters)  # into the axes of the stored pixels
     expected = cam.img_from_cam(rays.reshape(-1, 3)).reshape((*rays.shape[:2], 2))
     inner = (slice(2, -2), slice(2, -2))  # a spline has no more data half a pixel from the border
