@@ -18,7 +18,6 @@ from tests.conftest import composed as compose
 from tests.conftest import ramps
 from tests.training.conftest import masked, same
 from xrgs.config import CONF_DIR, TRAINING_VIEWS, Conf
-from xrgs.errors import XrgsError
 from xrgs.splat.gaussians import ActivatedGaussians, Gaussians
 from xrgs.splat.loss import photometric_loss, prepare_target
 from xrgs.splat.optimizer import SplatOptimizer
@@ -335,11 +334,6 @@ def test_a_skipped_step_has_no_update_and_every_component_is_asked(
     totals = [row["skipped_backward"] for row in result.history[:9]]
     assert totals == [0, 0, 0, 1, 2, 2, 2, 3, 3]
     assert "skipped_backward" not in trained.history[-1]
-
-
-def test_what_does_not_go_with_plus_names_the_key() -> None:
-    with pytest.raises(XrgsError, match=r"^splat\.raster\.absgrad="):
-        compose("+ablation=[plus,mcmc]")
 
 
 @pytest.mark.parametrize("decide", ["per_class", "current_view"])
