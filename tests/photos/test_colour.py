@@ -375,21 +375,34 @@ def test_numbers_that_are_not_known_are_refused(
         images.decode(tmp_path / "a.png")
 
 
-@pytest.mark.parametrize(("primaries", "transfer"), [(12, 13), (1, 5), (9, 16)])
-def test_avif_names_its_colours_by_number(tmp_path: Path, primaries: int, transfer: int) -> None:
-    Image.fromarray(smooth()).save(tmp_path / "a.avif", quality=100, subsampling="4:4:4")
-    plain = images.decode(tmp_path / "a.avif").pixels
-    content = bytearray((tmp_path / "a.avif").read_bytes())
-    at = content.index(b"colrnclx") + 8
-    content[at : at + 4] = struct.pack(">HH", primaries, transfer)
-    (tmp_path / "a.avif").write_bytes(content)
+@pytest.mark.parametrize(
+    ("suffix", "primaries", "transfer"),
+    [("avif", 12, 13), ("avif", 1, 5), ("avif", 9, 16), ("heic", 12, 13), ("heic", 9, 16)],
+)
+def test_avif_and_heic_name_their_colours_by_number(
+    tmp_path: Path, suffix: str, primaries: int, transfer: int
+) -> None:
+    file, values = tmp_path / f"a.{suffix}", smooth() / 255
+    if suffix == "heic":
+        pillow_heif.register_heif_opener()
+        numbers = {"color_primaries": primaries, "transfer_characteristics": transfer}
+        lossless = {"quality": -1, "chroma": 444, "matrix_coefficients": 0}
+        Image.fromarray(smooth()).save(file, **lossless, **numbers)
+    else:
+        Image.fromarray(smooth()).save(file, quality=100, subsampling="4:4:4")
+        values = images.decode(file).pixels.astype(np.float64)
+        content = bytearray(file.read_bytes())
+        at = content.index(b"colrnclx") + 8
+        content[at : at + 4] = struct.pack(">HH", primaries, transfer)
+        file.write_bytes(content)
     if transfer == 16:
-        with pytest.raises(ImageError, match=r"a\.avif: its brightness is HDR"):
-            images.decode(tmp_path / "a.avif")
+        with pytest.raises(ImageError, match=rf"a\.{suffix}: its brightness is HDR"):
+            images.decode(file)
         return
-    light = CURVES[transfer](plain.astype(np.float64)) @ to_linear_srgb(primaries).T
-    found = images.decode(tmp_path / "a.avif").pixels
-    assert np.abs(found - encoded(np.clip(light, 0, 1))).max() < 0.1 / 255
+    light = CURVES[transfer](values) @ to_linear_srgb(primaries).T
+    picture = images.decode(file)
+    assert np.abs(picture.pixels - encoded(np.clip(light, 0, 1))).max() < 0.1 / 255
+    assert len(picture.notes) == 1
 
 
 def test_the_profile_of_a_jpeg_2000_is_applied(tmp_path: Path) -> None:
@@ -428,24 +441,3 @@ def test_a_camera_set_to_adobe_rgb_says_so_in_exif(
     truth = encoded(stored ** (563 / 256) @ ADOBE_MATRIX.T)
     assert np.abs(picture.pixels - truth).max() < 0.1 / 255
     assert picture.notes == ("converted from Adobe RGB to sRGB",)
-
-
-@pytest.mark.parametrize(("primaries", "transfer"), [(12, 13), (9, 16)])
-def test_heic_names_its_colours_by_number(tmp_path: Path, primaries: int, transfer: int) -> None:
-    pillow_heif.register_heif_opener()
-    Image.fromarray(smooth()).save(
-        tmp_path / "a.heic",
-        quality=-1,
-        chroma=444,
-        matrix_coefficients=0,
-        color_primaries=primaries,
-        transfer_characteristics=transfer,
-    )
-    if transfer == 16:
-        with pytest.raises(ImageError, match=r"a\.heic: its brightness is HDR"):
-            images.decode(tmp_path / "a.heic")
-        return
-    picture = images.decode(tmp_path / "a.heic")
-    values = smooth() / 255
-    assert np.abs(picture.pixels - (p3(values) if primaries == 12 else values)).max() < 0.1 / 255
-    assert len(picture.notes) == (primaries == 12)
