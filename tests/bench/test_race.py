@@ -49,17 +49,6 @@ def test_a_run_is_planned_to_fit_each_budget(race: Any, power: float) -> None:
         assert len(runs) - before <= 4
 
 
-def test_after_some_tries_the_longest_run_within_a_budget_has_to_do(race: Any) -> None:
-    seconds = iter([5.0, 70.0, 40.0, 61.0])  # another program disturbs them
-    runs: list[Any] = []
-    while steps := race.plan(runs, 1.0):
-        runs.append(made(race, steps=steps, seconds=next(seconds)))
-    assert [run.seconds for run in runs] == [5.0, 70.0, 40.0, 61.0]
-    assert race.race_table.chosen(runs, 500, 1.0)["plus", "fern"].seconds == 40.0
-    with pytest.raises(SystemExit, match=r"fern / plus: 0\.01 min are less than a step takes"):
-        race.plan([made(race, steps=1, seconds=2.0)], 0.01)
-
-
 def test_time_that_writing_takes_does_not_count(race: Any, tmp_path: Path) -> None:
     lines: list[tuple[float, str]] = [(0.0, "Using CPU"), (9.0, "Loading a.png")]
     now = 10.0
@@ -96,13 +85,6 @@ def test_the_committed_race_makes_its_table_again(race: Any, tmp_path: Path) -> 
     table = (committed / "table.md").read_text()
     assert (tmp_path / "table.md").read_text() == table
     assert table in (BENCHMARKS.parent / "docs" / "speed.md").read_text()
-
-
-def test_programs_that_disturb_only_runs_that_are_not_counted_are_no_matter(race: Any) -> None:
-    probe, counted = made(race, others=0.5), made(race, steps=900, seconds=50.0, others=0.05)
-    assert "No result" not in "\n".join(race.race_table.notes([probe, counted]))
-    disturbed = replace(counted, others=0.5)
-    assert "up to 0.5 cores" in "\n".join(race.race_table.notes([probe, disturbed]))
 
 
 def scenes(race: Any, arm: str, psnr: Iterable[float], lpips: Iterable[float]) -> list[Any]:
