@@ -105,12 +105,3 @@ def test_each_size_has_an_exponent() -> None:
     assert larger["sizes"] == list(GAUSSIANS)
     assert larger["ms"] == pytest.approx([3e-3 * count**0.8 * 20 for count in GAUSSIANS])
     assert found["pixels", "10 Gaussians"]["sizes"] == [100, 400]
-
-
-def test_a_fit_is_the_least_squares_of_the_logarithms() -> None:
-    rows = [row for row in made_up_rows() if row["width"] == 10]
-    for row in rows:
-        row["forward_ms"], row["backward_ms"] = {10: 1, 100: 50, 1000: 10}[row["gaussians"]], 0
-    assert fit_growth(rows[:1]) == [], "of a single load"
-    # The middle one of three equidistant points does not change the slope.
-    assert [row["exponent"] for row in fit_growth(rows)] == [pytest.approx(0.5)]
