@@ -79,15 +79,6 @@ def test_a_crop_is_the_middle_of_the_view(load: Load) -> None:
     assert (same.camera.width, same.camera.height) == (40, 30)
 
 
-def test_the_seed_decides_a_random_load_and_larger_gaussians_overlap_more() -> None:
-    usual, other = (loads.random_load(50, 40, 30, seed) for seed in (0, 1))
-    larger = loads.random_load(50, 40, 30, 0, size_per_spacing=3.0)
-    of_usual, of_other, of_larger = (each.gaussians for each in (usual, other, larger))
-    np.testing.assert_allclose(of_larger.scales, 2 * of_usual.scales, rtol=1e-6)
-    np.testing.assert_array_equal(of_larger.means, of_usual.means)
-    assert not torch.equal(of_usual.means, of_other.means)
-
-
 @pytest.mark.slow
 def test_the_scene_is_as_heavy_as_a_trained_one() -> None:
     """56 Gaussians contribute to a pixel, counted with Eq. 8 and 14 in the middle rows."""

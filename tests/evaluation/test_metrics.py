@@ -1,4 +1,4 @@
-"""The metrics against scikit-image, kornia and float64 closed forms."""
+"""The metrics against scikit-image and float64 closed forms."""
 
 from __future__ import annotations
 
@@ -56,8 +56,7 @@ def test_ssim_is_its_definition() -> None:
     assert metrics.ssim(image, image) == pytest.approx(1, abs=1e-6)
 
 
-def test_psnr_is_scikit_images_and_kornias() -> None:
-    from kornia.metrics import psnr
+def test_psnr_is_scikit_images() -> None:
     from skimage.metrics import peak_signal_noise_ratio
 
     image, target = pair()
@@ -66,7 +65,6 @@ def test_psnr_is_scikit_images_and_kornias() -> None:
         peak_signal_noise_ratio(target.numpy().astype(float), image.numpy().astype(float)),
         rel=1e-12,
     )
-    assert value == pytest.approx(psnr(image, target, 1.0).item(), rel=1e-6)
     flat = torch.full((12, 13, 3), 0.25)
     assert metrics.psnr(flat, flat + 0.5) == pytest.approx(20 * math.log10(2), rel=1e-12)
     assert metrics.psnr(torch.zeros(12, 13, 3), torch.ones(12, 13, 3)) == 0
