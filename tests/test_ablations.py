@@ -65,7 +65,7 @@ def delta(conf: Conf, baseline: Conf) -> dict[str, Any]:
 def test_each_ablation_is_a_cell_of_its_own_and_changes_training_only(composed: Compose) -> None:
     assert cell_id(composed("+ablation=baseline")) == cell_id(composed())
     # Two controls differ only in the cell whose number of Gaussians they have to reach.
-    cells = {(cell_id(composed()), None): "baseline"}
+    cells: dict[tuple[str, str | None], str] = {(cell_id(composed()), None): "baseline"}
     for name in ABLATIONS:
         conf = composed(f"+ablation={name}")
         assert cells.setdefault((cell_id(conf), conf.matched_to), name) == name

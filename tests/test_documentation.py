@@ -54,22 +54,6 @@ def test_pages_that_code_and_notes_name_are_there() -> None:
     assert named <= {f"docs/{page.name}" for page in (ROOT / "docs").glob("*.md")}
 
 
-def test_commands_name_scenes_as_tables_do() -> None:
-    """`scene=llff/fern` is a file of `conf/scene/`, and the scene's name is in it."""
-    names = {
-        name
-        for file in (ROOT / "conf/scene").rglob("*.yaml")
-        for name in re.findall(r"^ *name: (\w+)", file.read_text(encoding="utf-8"), re.MULTILINE)
-    }
-    used = {
-        name
-        for page in pages()
-        for line in re.findall(r"^xrgs-.* --scenes ([^-#\n]+)", page.read_text(), re.MULTILINE)
-        for name in line.split()
-    }
-    assert {"fern", "horns"} <= used <= names
-
-
 def test_the_tree_of_the_readme_has_every_page_and_every_package() -> None:
     tree = (ROOT / "README.md").read_text(encoding="utf-8").partition("## Files\n\n```\n")[2]
     parts = re.split(r"^(\w+)/", tree.partition("```")[0], flags=re.MULTILINE)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import math
 import shutil
 from collections.abc import Iterable
 from dataclasses import replace
@@ -68,14 +67,6 @@ def test_time_that_writing_takes_does_not_count(race: Any, tmp_path: Path) -> No
     assert {file.name for file in tmp_path.iterdir()} == {"splat_10.ply", "splat_30.ply"} | {
         f"splat_{step}.ply" for step in range(35, 100, 5)
     }, "what is written later is none of its files"
-
-
-def test_runs_are_read_as_they_were_written(race: Any, tmp_path: Path) -> None:
-    runs = [made(race, lpips=math.nan, machine="AMD, 2 cores"), made(race, cell="0123")]
-    table = race.table_text([race.asdict(run) for run in runs])
-    (tmp_path / "race.csv").write_text(table)
-    assert repr(race.race_table.read(tmp_path)) == repr(runs)
-    assert race.race_table.read(tmp_path / "none") == []
 
 
 def test_the_committed_race_makes_its_table_again(race: Any, tmp_path: Path) -> None:

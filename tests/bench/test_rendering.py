@@ -44,11 +44,6 @@ def test_errors_tell_wrong_settings_from_right_ones(load: Load) -> None:
         assert found["wrong"][name] > least
 
 
-def test_loads_too_large_for_torch_are_left_out() -> None:
-    large = random_load(10, 600, 500, seed=0)
-    assert rendering.time_load(large, [RenderMethod("torch", "torch")], [1], repeats=1) == []
-
-
 @pytest.fixture(scope="module")
 def shortcuts() -> dict[str, dict[str, Any]]:
     """Shortcuts on a load with a third out of view and a third below `alpha_min`."""

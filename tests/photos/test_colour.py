@@ -385,9 +385,9 @@ def test_avif_and_heic_name_their_colours_by_number(
     file, values = tmp_path / f"a.{suffix}", smooth() / 255
     if suffix == "heic":
         pillow_heif.register_heif_opener()
-        numbers = {"color_primaries": primaries, "transfer_characteristics": transfer}
-        lossless = {"quality": -1, "chroma": 444, "matrix_coefficients": 0}
-        Image.fromarray(smooth()).save(file, **lossless, **numbers)
+        options: dict[str, Any] = {"quality": -1, "chroma": 444, "matrix_coefficients": 0}
+        options |= {"color_primaries": primaries, "transfer_characteristics": transfer}
+        Image.fromarray(smooth()).save(file, **options)
     else:
         Image.fromarray(smooth()).save(file, quality=100, subsampling="4:4:4")
         values = images.decode(file).pixels.astype(np.float64)

@@ -94,11 +94,6 @@ def test_flat_images_stay_finite(backend: str, levels: tuple[float, float], nois
     assert gradient.isfinite().all()
 
 
-def test_a_target_keeps_no_graph() -> None:
-    target = prepare_target(noise(12, 12).requires_grad_())
-    assert not any(x.requires_grad for x in (target.image, target.mean, target.variance))
-
-
 def test_wrong_shapes_are_refused() -> None:
     target = prepare_target(torch.zeros(20, 24, 3))
     with pytest.raises(ValueError, match=r"image must be \[H, W, 3\], got \[20, 20\]"):

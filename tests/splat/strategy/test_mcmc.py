@@ -12,10 +12,9 @@ from torch import Tensor
 from tests.splat.scenes import make_optimizer, take_step
 from tests.splat.strategy.gsplats import SCENE_SCALE, TheirsMCMC, random_values, relocation
 from xrgs.splat.gaussians import PARAMETERS
-from xrgs.splat.settings import STRATEGIES, DensifySettings
+from xrgs.splat.settings import DensifySettings
 from xrgs.splat.strategy.base import Refinement
 from xrgs.splat.strategy.mcmc import MOST_SHARES, MCMCStrategy, share_out
-from xrgs.training import loop
 
 SETTINGS = DensifySettings(stop=25_000, budget=1.0, noise=5e5)
 NOTHING = torch.zeros(0, dtype=torch.bool)
@@ -194,7 +193,3 @@ def test_the_defaults_are_gsplats() -> None:
     assert (theirs.refine_start_iter, theirs.refine_stop_iter) == (SETTINGS.start, SETTINGS.stop)
     assert (theirs.refine_every, theirs.noise_lr) == (SETTINGS.every, SETTINGS.noise)
     assert theirs.min_opacity == SETTINGS.prune_opacity
-
-
-def test_every_name_of_a_strategy_has_a_class() -> None:
-    assert tuple(loop.STRATEGIES) == STRATEGIES
