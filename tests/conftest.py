@@ -520,8 +520,6 @@ class Server:
     """Number of bytes after which the body of each of the first answers breaks off."""
     answers: list[bytes] = field(default_factory=list)
     """Whole answers, headers included, to the first requests, in place of the content."""
-    drips: bool = False
-    """Whether the body is sent byte by byte, 100 in a second."""
     asked: list[str | None] = field(default_factory=list)
     """The Range header of each request so far, None if there was none."""
     url: str = ""
@@ -554,10 +552,6 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("ETag", state.etag)
         self.send_header("Content-Length", str(len(body)))
         self.end_headers()
-        if state.drips:
-            for byte in body:
-                self.wfile.write(bytes([byte]))
-                time.sleep(0.01)
         self.wfile.write(body[: state.cuts.pop(0)] if state.cuts else body)
 
     def log_message(self, format: str, *args: Any) -> None:  # noqa: A002

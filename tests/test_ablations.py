@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import re
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -20,17 +21,6 @@ from xrgs.sweep.axes import expand
 ABLATIONS = sorted({path.stem for path in (CONF_DIR / "ablation").glob("*.yaml")} - {"baseline"})
 SWEEPS = CONF_DIR / "sweeps" if (CONF_DIR / "sweeps").is_dir() else CONF_DIR.parent / "sweeps"
 STUDY = Path(__file__).parents[1] / "docs" / "study.md"
-#: The ablation that has one of the values of each setting in the table of docs/study.md.
-SENSITIVITY = {
-    "components.consistency.weight=0.05,0.1,0.2,0.5,1": "consistency",
-    "components.densify.decide=current_view,per_class,own_threshold": "densify",
-    "components.densify.lr_grow=1,2,4 components.densify.lr_prune=1,2,4 +ablation=densify": (
-        "densify"
-    ),
-    "components.loss_weighting.lr_weight=0.1,0.25,0.5,0.75": "loss_weighting",
-    "components.render_scale.gamma=0.1,0.25,0.5,1": "render_scale",
-    "components.gradient_scaling.lr_scale=0.1,0.3,0.5,0.75": "gradient_scaling",
-}
 
 Compose = Callable[..., Conf]
 
@@ -72,22 +62,15 @@ def delta(conf: Conf, baseline: Conf) -> dict[str, Any]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ABLATIONS)
-def test_each_ablation_is_another_cell(name: str, composed: Compose) -> None:
-    baseline, ablation = composed(), composed(f"+ablation={name}")
-    if ablation.matched_to is not None:  # a sweep fills in that cell's number of Gaussians
-        ablation = composed(f"+ablation={name}", "components.count_matched.gaussians=1000")
-    assert cell_id(ablation) != cell_id(baseline)
-    changed = delta(ablation, baseline)
-    assert {key.split(".")[0] for key in changed} <= {"components", "splat", "train", "matched_to"}
-
-
-@pytest.mark.slow
-def test_no_two_ablations_are_the_same_cell(composed: Compose) -> None:
-    confs = [composed(f"+ablation={name}") for name in ABLATIONS]
-    # Two controls differ only in the cell whose number of Gaussians they have to reach.
-    assert len({(cell_id(conf), conf.matched_to) for conf in confs}) == len(ABLATIONS)
+def test_each_ablation_is_a_cell_of_its_own_and_changes_training_only(composed: Compose) -> None:
     assert cell_id(composed("+ablation=baseline")) == cell_id(composed())
+    # Two controls differ only in the cell whose number of Gaussians they have to reach.
+    cells: dict[tuple[str, str | None], str] = {(cell_id(composed()), None): "baseline"}
+    for name in ABLATIONS:
+        conf = composed(f"+ablation={name}")
+        assert cells.setdefault((cell_id(conf), conf.matched_to), name) == name
+        changed = {key.split(".")[0] for key in delta(conf, composed())}
+        assert changed <= {"components", "splat", "train", "matched_to"}, name
 
 
 @pytest.mark.slow
@@ -107,40 +90,15 @@ def test_each_value_of_a_sweep_file_makes_a_config(file: Path, composed: Compose
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("names", "whole"),
-    [
-        (("loss_weighting", "gradient_scaling"), "loss_gradient"),
-        (("loss_weighting", "gradient_scaling", "densify", "consistency"), "xrgs"),
-        (("xrgs", "mip"), None),
-        (("densify", "absgrad"), None),
-    ],
-)
-def test_ablations_can_be_combined(
-    names: tuple[str, ...], whole: str | None, composed: Compose
+def test_the_settings_of_the_table_of_sensitivity_each_vary_one_component(
+    composed: Compose,
 ) -> None:
-    baseline = composed()
-    layers = [delta(composed(f"+ablation={name}"), baseline) for name in names]
-    combined = composed(f"+ablation=[{','.join(names)}]")
-    assert delta(combined, baseline) == {key: v for layer in layers for key, v in layer.items()}
-    if whole is not None:
-        assert combined == composed(f"+ablation={whole}")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("words", SENSITIVITY)
-def test_a_sweep_of_sensitivity_varies_one_ablation_around_its_value(
-    words: str, composed: Compose
-) -> None:
-    page, axes, count = STUDY.read_text(), words.split(), 1
-    for key, _, values in (axis.partition("=") for axis in axes):
-        assert f"`{key}" in page
-        assert f"`{values}`" in page or f"`{key}={values}`" in page
-        count *= len(values.split(","))
-    cells = [composed(*spec.overrides) for spec in expand(axes) if spec.changes]
-    equal = [f"components.densify.lr_{name}=1" for name in ("grow", "prune") if "decide" in words]
-    expected = composed(f"+ablation={SENSITIVITY[words]}", *equal)
-    assert sum(cell == expected for cell in cells) == 1
-    assert len({cell_id(cell) for cell in cells}) == len(cells) == count
-    changed = {key.split(".")[1] for cell in cells for key in delta(cell, composed())}
-    assert len(changed) == 1, "one component"
+    rows = re.findall(r"^\| (`components.*?) \| `([\w.,]+)`", STUDY.read_text(), re.MULTILINE)
+    assert len(rows) == 6
+    for setting, values in rows:
+        on = re.findall(r"`(\+\S+)`", setting)
+        for key in re.findall(r"`(components\.\w+\.\w+)`", setting):
+            cells = [composed(*on, f"{key}={value}") for value in values.split(",")]
+            assert len({cell_id(cell) for cell in cells}) == len(cells)
+            changed = {name for cell in cells for name in delta(cell, composed())}
+            assert {name.split(".")[1] for name in changed} == {key.split(".")[1]}

@@ -7,6 +7,7 @@ import importlib.util
 import json
 import os
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -19,7 +20,6 @@ from typing import Any
 import pytest
 
 FILE = Path(__file__).resolve().parents[1] / "build_backend" / "xrgs_build.py"
-Programs = Callable[..., None]
 
 
 @dataclass
@@ -75,55 +75,48 @@ def backend(scikit_build: ScikitBuild, monkeypatch: pytest.MonkeyPatch) -> Any:
     return module
 
 
-@pytest.fixture
-def programs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Programs:
-    """(**exit codes by name) -> puts programs that end with them into PATH, which is else empty.
-
-    `cxx` stands for c++, `gxx` for g++ and `clangxx` for clang++.
-    """
-
-    def put(**codes: int) -> None:
-        for name, code in codes.items():
-            file = tmp_path / name.replace("xx", "++")
-            file.write_text(f"#!/bin/sh\nexit {code}\n")
-            file.chmod(0o755)
-        monkeypatch.setenv("PATH", str(tmp_path))
-
-    return put
-
-
-def requires(backend: Any) -> list[str]:
-    wheel: list[str] = backend.get_requires_for_build_wheel({})
-    assert backend.get_requires_for_build_editable({}) == wheel
-    assert wheel[0] == "ninja"
+@pytest.mark.parametrize(
+    ("programs", "cxx", "compiler", "said"),
+    [
+        ({"c++": 0}, "", "{bin}/c++", ""),
+        ({"c++": 1, "g++": 1, "clang++": 0}, "", "{bin}/clang++", ""),
+        ({"c++": 1, "mine": 0}, "{bin}/mine -pipe", "{bin}/mine -pipe", ""),
+        ({"c++": 0}, "/nonexistent", "/nonexistent", "CXX=/nonexistent is no .*without kernels"),
+        ({"c++": 0}, "'", "'", "CXX=' is no C.* compiler that works"),
+        ({"c++": 1}, "", None, r"c\+\+, g\+\+, clang\+\+.* ziglang is missing: "),
+    ],
+)
+def test_the_compiler_is_that_of_cxx_or_else_the_first_that_works(
+    backend: Any,
+    scikit_build: ScikitBuild,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    programs: dict[str, int],
+    cxx: str,
+    compiler: str | None,
+    said: str,
+) -> None:
+    """Nothing replaces CXX's. A build without a compiler requires `ziglang`, and goes on."""
+    for name, code in programs.items():
+        (tmp_path / name).write_text(f"#!/bin/sh\nexit {code}\n")
+        (tmp_path / name).chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    if cxx:
+        monkeypatch.setenv("CXX", cxx.format(bin=tmp_path))
+        installed = importlib.machinery.ModuleSpec("ziglang", None)
+        monkeypatch.setattr(importlib.util, "find_spec", lambda _: installed)
+    before = os.environ.get("CXX")
+    required = ["ninja", *([] if compiler else [backend.ZIGLANG])]
+    assert backend.get_requires_for_build_wheel({}) == required
+    assert backend.get_requires_for_build_editable({}) == required
     assert backend.get_requires_for_build_sdist({}) == []
-    return wheel[1:]
-
-
-def test_a_machine_without_a_compiler_requires_ziglang(backend: Any) -> None:
-    assert requires(backend) == [backend.ZIGLANG]
-
-
-@pytest.mark.parametrize("name", ["cxx", "clangxx"])
-def test_a_machine_with_a_compiler_requires_nothing(
-    backend: Any, scikit_build: ScikitBuild, programs: Programs, name: str, tmp_path: Path
-) -> None:
-    programs(**{name: 0})
-    assert requires(backend) == []
-    assert backend.build_wheel("dist") == "xrgs.whl"
-    assert scikit_build.compiler == str(tmp_path / name.replace("xx", "++"))
-    assert "CXX" not in os.environ
-
-
-def test_the_first_compiler_that_works_is_the_one_that_builds(
-    backend: Any, scikit_build: ScikitBuild, programs: Programs, tmp_path: Path
-) -> None:
-    programs(cxx=1, gxx=1)
-    assert requires(backend) == [backend.ZIGLANG]
-    programs(clangxx=0)
-    assert requires(backend) == []
-    backend.build_editable("dist")
-    assert scikit_build.compiler == str(tmp_path / "clang++")
+    for build in (backend.build_wheel, backend.build_editable):
+        assert build("dist") == "xrgs.whl"
+        assert scikit_build.compiler == (compiler and compiler.format(bin=tmp_path))
+        assert os.environ.get("CXX") == before
+    assert re.search(said, err := capsys.readouterr().err)
+    assert bool(err) == bool(said)
 
 
 @pytest.mark.parametrize(("system", "machine"), [("Darwin", "arm64"), ("Linux", "riscv64")])
@@ -132,54 +125,7 @@ def test_other_machines_get_no_ziglang(
 ) -> None:
     monkeypatch.setattr(platform, "system", lambda: system)
     monkeypatch.setattr(platform, "machine", lambda: machine)
-    assert requires(backend) == []
-
-
-def test_cxx_names_the_compiler_with_its_options(
-    backend: Any,
-    scikit_build: ScikitBuild,
-    programs: Programs,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    programs(cxx=1, mine=0)
-    command = f"{tmp_path / 'mine'} -pipe"
-    monkeypatch.setenv("CXX", command)
-    assert requires(backend) == []
-    backend.build_wheel("dist")
-    assert scikit_build.compiler == command
-    assert os.environ["CXX"] == command
-
-
-@pytest.mark.parametrize("command", ["/nonexistent", "'"])
-def test_nothing_replaces_a_compiler_that_cxx_names(
-    backend: Any,
-    scikit_build: ScikitBuild,
-    programs: Programs,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    command: str,
-) -> None:
-    programs(cxx=0)
-    found = importlib.machinery.ModuleSpec("ziglang", None)
-    monkeypatch.setattr(importlib.util, "find_spec", lambda _: found)
-    monkeypatch.setenv("CXX", command)
-    assert requires(backend) == []
-    assert backend.build_wheel("dist") == "xrgs.whl"
-    assert scikit_build.compiler == command
-    message = capsys.readouterr().err
-    assert f"CXX={command} is no C++17 compiler that works" in message
-    assert "without kernels" in message
-
-
-def test_without_any_compiler_the_build_says_so_and_goes_on(
-    backend: Any, scikit_build: ScikitBuild, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert backend.build_wheel("dist") == "xrgs.whl"
-    assert scikit_build.compiler is None
-    message = capsys.readouterr().err
-    assert "c++, g++, clang++" in message
-    assert "ziglang is missing" in message
+    assert backend.get_requires_for_build_wheel({}) == ["ninja"]
 
 
 def test_ziglang_builds_where_nothing_else_does(

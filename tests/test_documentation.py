@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
+import xrgs
+
 ROOT = Path(__file__).parents[1]
 #: The target of a link or a picture; those of the web and of an address are not looked at.
 _LINK = re.compile(r"\]\((?!\w+:)([^)\s]+)\)")
@@ -52,22 +54,6 @@ def test_pages_that_code_and_notes_name_are_there() -> None:
     assert named <= {f"docs/{page.name}" for page in (ROOT / "docs").glob("*.md")}
 
 
-def test_commands_name_scenes_as_tables_do() -> None:
-    """`scene=llff/fern` is a file of `conf/scene/`, and the scene's name is in it."""
-    names = {
-        name
-        for file in (ROOT / "conf/scene").rglob("*.yaml")
-        for name in re.findall(r"^ *name: (\w+)", file.read_text(encoding="utf-8"), re.MULTILINE)
-    }
-    used = {
-        name
-        for page in pages()
-        for line in re.findall(r"^xrgs-.* --scenes ([^-#\n]+)", page.read_text(), re.MULTILINE)
-        for name in line.split()
-    }
-    assert {"fern", "horns"} <= used <= names
-
-
 def test_the_tree_of_the_readme_has_every_page_and_every_package() -> None:
     tree = (ROOT / "README.md").read_text(encoding="utf-8").partition("## Files\n\n```\n")[2]
     parts = re.split(r"^(\w+)/", tree.partition("```")[0], flags=re.MULTILINE)
@@ -102,3 +88,11 @@ def test_the_tested_versions_are_those_that_are_allowed() -> None:
     assert tested.keys() == allowed.keys()
     for name, versions in tested.items():
         assert all(allowed[name].contains(version) for version in versions), name
+
+
+def test_the_site_has_every_public_name_and_every_study() -> None:
+    api = (ROOT / "docs/api.md").read_text(encoding="utf-8")
+    assert all(f"\n::: xrgs.{name}\n" in api for name in xrgs.__all__)
+    studies = {str(file.relative_to(ROOT)) for file in ROOT.glob("reports/*/NOTES.md")}
+    navigation = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    assert set(re.findall(r"reports/\w+/NOTES\.md", navigation)) == studies

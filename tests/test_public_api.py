@@ -6,13 +6,13 @@ import ast
 import inspect
 import os
 import subprocess
-import sys
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 
 import xrgs
+from tests.runtime.programs import run_python
 from xrgs.config import Conf
 from xrgs.training import count_matching
 from xrgs.training.dataset import Dataset
@@ -25,10 +25,7 @@ WITHOUT_TORCH = ("RasterSettings", "Store", "XrgsError", "compose")
 def python(script: str, **environment: str) -> subprocess.CompletedProcess[str]:
     """Run a script in a new interpreter, with no policy of OpenMP but in `environment`."""
     kept = {name: text for name, text in os.environ.items() if name != "OMP_WAIT_POLICY"}
-    command = [sys.executable, "-P", "-c", script]
-    return subprocess.run(
-        command, capture_output=True, text=True, check=True, env=kept | environment
-    )
+    return run_python(script, check=True, env=kept | environment)
 
 
 def test_import_is_light() -> None:

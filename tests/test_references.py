@@ -5,8 +5,6 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-import yaml
-
 ROOT = Path(__file__).resolve().parents[1]
 BIBLIOGRAPHY = ROOT / "docs" / "references.bib"
 #: Folders and files that cite; a citation is a key in brackets, like [kerbl2023].
@@ -38,15 +36,3 @@ def test_every_citation_is_in_the_bibliography() -> None:
     keys = bibliography()
     unknown = {file: missing for file, cited in citations().items() if (missing := cited - keys)}
     assert not unknown
-
-
-def test_the_citation_file_has_what_its_format_requires() -> None:
-    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
-    assert citation["cff-version"] == "1.2.0"
-    assert citation["title"]
-    assert citation["message"]
-    assert citation["authors"]
-    for reference in citation["references"]:
-        assert reference["type"] in {"article", "software", "conference-paper"}
-        assert reference["title"]
-        assert reference["authors"]

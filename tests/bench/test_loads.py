@@ -38,13 +38,6 @@ def test_a_file_gives_back_what_was_written(load: Load, file: Path) -> None:
     assert again.name == "load"
 
 
-def test_doubles_and_whole_numbers_are_read_too(load: Load, file: Path) -> None:
-    rewritten(file, means=load.gaussians.means.double().numpy(), viewmat=np.eye(4, dtype=np.int64))
-    again = loads.read(file)
-    assert again.gaussians.means.dtype == again.camera.viewmat.dtype == torch.float32
-    assert torch.equal(again.gaussians.means, load.gaussians.means)
-
-
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
@@ -76,15 +69,6 @@ def test_what_is_no_npz_is_refused(tmp_path: Path) -> None:
             loads.read(tmp_path / "bad.npz")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("count", [300, 3000])
-def test_random_loads_put_as_many_gaussians_on_a_pixel_as_trained_ones(count: int) -> None:
-    load = loads.random_load(count, 80, 60, seed=0)
-    done = rasterize_parameters(*load.gaussians, load.camera, RasterSettings(), sh_degree=3)
-    assert 20 <= done.evaluations / (80 * 60) <= 150
-    assert done.alpha.mean() > 0.9
-
-
 def test_a_crop_is_the_middle_of_the_view(load: Load) -> None:
     crop = load.center_crop(20, 10)
     whole, middle = render(load), render(crop)
@@ -93,22 +77,6 @@ def test_a_crop_is_the_middle_of_the_view(load: Load) -> None:
     assert (middle - whole[11:21, 11:31]).abs().mean() > 0.02
     same = load.center_crop(400, 400)
     assert (same.camera.width, same.camera.height) == (40, 30)
-
-
-def test_a_smaller_view_shows_the_same(load: Load) -> None:
-    small = load.downscaled(2)
-    assert (small.camera.width, small.camera.height) == (20, 15)
-    corner = load.camera.K.inverse() @ torch.tensor([40.0, 30.0, 1.0])
-    torch.testing.assert_close(small.camera.K @ corner, torch.tensor([20.0, 15.0, 1.0]))
-
-
-def test_the_seed_decides_a_random_load_and_larger_gaussians_overlap_more() -> None:
-    usual, other = (loads.random_load(50, 40, 30, seed) for seed in (0, 1))
-    larger = loads.random_load(50, 40, 30, 0, size_per_spacing=3.0)
-    of_usual, of_other, of_larger = (each.gaussians for each in (usual, other, larger))
-    np.testing.assert_allclose(of_larger.scales, 2 * of_usual.scales, rtol=1e-6)
-    np.testing.assert_array_equal(of_larger.means, of_usual.means)
-    assert not torch.equal(of_usual.means, of_other.means)
 
 
 @pytest.mark.slow

@@ -131,12 +131,6 @@ def values(gltf: pygltflib.GLTF2, number: int) -> NDArray[Any]:
     return np.frombuffer(content, kind).reshape(accessor.count, width)
 
 
-def with_linear(linear: NDArray[np.float64]) -> NDArray[np.float64]:
-    matrix = np.eye(4)
-    matrix[:3, :3] = linear
-    return matrix
-
-
 def test_pygltflib_reads_what_was_written(file: Path) -> None:
     gaussians = make(5)
     write_glb(file, gaussians, up=(0, 0, 2))
@@ -162,7 +156,9 @@ def test_pygltflib_reads_what_was_written(file: Path) -> None:
         turned.as_matrix() @ rotation_matrices(gaussians.quats.detach().double()).numpy(),
         atol=1e-6,
     )
-    gaussians = transformed(gaussians, with_linear(turned.as_matrix()))
+    matrix = np.eye(4)
+    matrix[:3, :3] = turned.as_matrix()
+    gaussians = transformed(gaussians, matrix)
     np.testing.assert_allclose(
         read[f"{EXTENSION}:SCALE"], gaussians.scales.detach().exp(), rtol=1e-6
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import math
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -11,6 +10,7 @@ import gsplat
 import pytest
 import torch
 from gsplat.cuda import _torch_impl
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from xrgs.formats.gsplat_api import RenderMode, rasterization
@@ -39,13 +39,6 @@ class Scene(NamedTuple):
         return self._asdict() | {"width": WIDTH, "height": HEIGHT}
 
 
-def rotation_about(axis: tuple[float, float, float], angle: float) -> Tensor:
-    """Rodrigues' formula."""
-    x, y, z = torch.nn.functional.normalize(torch.tensor(axis, dtype=torch.float64), dim=0).tolist()
-    K = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
-    return torch.eye(3, dtype=torch.float64) + math.sin(angle) * K + (1 - math.cos(angle)) * K @ K
-
-
 def scene(count: int = 80, *, per_camera: bool = False, sh_degree: int | None = None) -> Scene:
     generator = torch.Generator().manual_seed(0)
 
@@ -54,7 +47,8 @@ def scene(count: int = 80, *, per_camera: bool = False, sh_degree: int | None = 
 
     means = (uniform(count, 3) - 0.5) * torch.tensor([6.0, 5.0, 5.0]) + torch.tensor([0, 0, 2.0])
     viewmats = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
-    viewmats[1, :3, :3] = rotation_about((0.3, 1.0, 0.2), 0.35)
+    turn = Rotation.from_rotvec([0.1, 0.33, 0.066])
+    viewmats[1, :3, :3] = torch.from_numpy(turn.as_matrix())
     viewmats[1, :3, 3] = torch.tensor([0.1, -0.2, 0.4])
     Ks = torch.tensor(
         [[[40.0, 0, 18], [0, 38.0, 15], [0, 0, 1]], [[33.0, 0, 20], [0, 35.0, 13], [0, 0, 1]]],
@@ -543,14 +537,8 @@ def test_a_gaussian_far_larger_than_the_image_covers_it(backend: str, size: floa
         ({"viewmats": torch.eye(4)}, r"viewmats must be \[C, 4, 4\]"),
         ({"width": 0}, "width and height must be at least 1"),
         ({"opacities": torch.zeros(80, 1)}, "opacities"),
-        ({"viewmats": 2 * torch.eye(4).repeat(2, 1, 1)}, "camera 0: viewmat must be a rotation"),
         ({"backgrounds": torch.full((2, 3), torch.inf)}, "backgrounds has values that are not"),
         ({"far_plane": 1.0, "near_plane": 2.0}, "far_plane must be above near_plane"),
-        ({"Ks": torch.diag(torch.tensor([40.0, 40, 2])).repeat(2, 1, 1)}, "the last row of K"),
-        (
-            {"viewmats": torch.diag(torch.tensor([1.0, 1, 1, 2])).repeat(2, 1, 1)},
-            "camera 0: the last row of viewmat must be",
-        ),
         ({"scales": torch.full((80, 3), 1e19)}, "scales: a Gaussian is larger than"),
         ({"means": torch.zeros(80, 3, device="meta")}, "means is on meta: xrgs renders on the CPU"),
     ],

@@ -223,8 +223,6 @@ def test_the_filter_of_mip_splatting_is_applied(
     ("old", "new", "message"),
     [
         (b"ply\n", b"plx\n", "is not a .ply file"),
-        (b"vertex 5", b"vertex 6", "need 1488 bytes, 1240 are left"),
-        (b"vertex 5", b"vertex 999999999999", "1240 are left"),
         (b"float scale_2", b"float size_2", "the flat Gaussians of 2D Gaussian Splatting"),
         (b"float opacity", b"float opac", "a point cloud and no Gaussians: .*missing: opacity"),
         (b"float rot_1", b"float r", "ply: properties are missing: rot_1"),

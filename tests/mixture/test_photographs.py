@@ -194,18 +194,14 @@ def test_a_depth_map_is_left_out_beside_photographs(
     assert note.startswith(f"left out: depth.{suffix} (taken for a depth map: it has one channel")
 
 
-def write_cutout(file: Path, hidden: int) -> Path:
-    """White, with a quarter of alpha 0 on the left and one of 0.6 on the right."""
-    pixels = np.full((40, 60, 4), 255, np.uint8)
-    pixels[:, :15] = (hidden, hidden, hidden, 0)
-    pixels[:, 45:, 3] = 153
-    Image.fromarray(pixels).save(file)
-    return file
-
-
 @pytest.mark.parametrize("alpha", ["composite", "mask"])
 def test_transparent_pixels_get_the_background_alone(tmp_path: Path, alpha: str) -> None:
-    files = [write_cutout(tmp_path / f"{hidden}.png", hidden) for hidden in (20, 230)]
+    files = [tmp_path / f"{hidden}.png" for hidden in (20, 230)]
+    for file in files:  # white, with a quarter of alpha 0 on the left and one of 0.6 on the right
+        pixels = np.full((40, 60, 4), 255, np.uint8)
+        pixels[:, :15] = (*[int(file.stem)] * 3, 0)
+        pixels[:, 45:, 3] = 153
+        Image.fromarray(pixels).save(file)
     scene = replace(scene_of(*files), alpha=alpha, background=(0.2, 0.2, 0.2))
     photos = prepare_hr_views(scene, whole_sizes(), tmp_path)
     for i in (0, 1):

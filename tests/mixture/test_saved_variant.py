@@ -185,17 +185,6 @@ def test_a_file_that_cant_be_read_now_says_nothing_of_the_variant(
     assert f"{name}: Input/output error" in line
 
 
-def test_everything_is_on_the_disk_before_the_variant_has_its_name(
-    tmp_path: Path, disk_events: list[str]
-) -> None:
-    """Each folder that holds a new name is synced before the rename, and the last one after."""
-    made = make(tmp_path)
-    variant = saved_variant.freeze(made, "key", made.folder, tmp_path, {})
-    named = disk_events.index(f"rename work to {variant.id}")
-    assert {"sync work", "sync images", "sync points.npz"} <= set(disk_events[:named])
-    assert disk_events[named + 1 :] == [f"sync {tmp_path.name}"]
-
-
 def test_folders_are_set_aside_under_names_that_are_free(tmp_path: Path) -> None:
     folder = tmp_path / "key-hash"
     (tmp_path / ".key-hash.aside-2").write_text("a file")

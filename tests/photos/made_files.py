@@ -11,19 +11,18 @@ from numpy.typing import NDArray
 from PIL import ImageCms
 
 #: The numbers of EXIF's types.
-BYTE, ASCII, SHORT, LONG, RATIONAL, UNDEFINED, FLOAT = 1, 2, 3, 4, 5, 7, 11
+BYTE, ASCII, SHORT, LONG, FLOAT = 1, 2, 3, 4, 11
 
 
 def png(
     samples: NDArray[Any],
     *chunks: tuple[bytes, bytes],
     bits: int = 16,
-    colours: int | None = None,
     interlaced: bool = False,
 ) -> bytes:
     """A PNG of samples [H, W, C]; `chunks` come before the pixels, which are filtered by none."""
     height, width, count = samples.shape
-    colour_type = {1: 0, 2: 4, 3: 2, 4: 6}[count] if colours is None else colours
+    colour_type = {1: 0, 2: 4, 3: 2, 4: 6}[count]
     stored = samples.astype(">u2" if bits == 16 else "u1")
     passes = [stored]
     if interlaced:  # Adam7
@@ -38,18 +37,18 @@ def png(
     )
 
 
-def exif_entry(kind: int, count: int, value: bytes, tag: int = 0x0112) -> bytes:
-    """EXIF of one entry, by default the orientation."""
-    entry = struct.pack("<HHI", tag, kind, count) + value.ljust(4, b"\0")
+def exif_entry(kind: int, count: int, value: bytes) -> bytes:
+    """EXIF of one entry, the orientation."""
+    entry = struct.pack("<HHI", 0x0112, kind, count) + value.ljust(4, b"\0")
     return b"Exif\0\0II*\0" + struct.pack("<IH", 8, 1) + entry + bytes(4)
 
 
-def with_entry(tiff: bytes, kind: int, count: int, value: bytes, tag: int = 0x0112) -> bytes:
-    """A little-endian TIFF with one more entry in its first directory."""
+def with_entry(tiff: bytes, kind: int, count: int, value: bytes) -> bytes:
+    """A little-endian TIFF with an orientation in its first directory."""
     start = struct.unpack("<I", tiff[4:8])[0]
     number = struct.unpack("<H", tiff[start : start + 2])[0]
     entries = [tiff[start + 2 + 12 * i : start + 14 + 12 * i] for i in range(number)]
-    entries.append(struct.pack("<HHI", tag, kind, count) + value.ljust(4, b"\0"))
+    entries.append(struct.pack("<HHI", 0x0112, kind, count) + value.ljust(4, b"\0"))
     entries.sort(key=lambda entry: struct.unpack("<H", entry[:2])[0])
     padded = tiff + bytes(len(tiff) % 2)
     directory = struct.pack("<H", len(entries)) + b"".join(entries) + bytes(4)

@@ -133,14 +133,6 @@ def test_exif_behind_the_pixels_of_a_png_is_found(tmp_path: Path) -> None:
         images.read(tmp_path / "a.png")
 
 
-def test_a_file_that_is_no_image_is_named(tmp_path: Path) -> None:
-    (tmp_path / "a.png").write_text("hello")
-    with pytest.raises(ImageError, match=r"a\.png"):
-        images.read(tmp_path / "a.png")
-    with pytest.raises(ImageError, match=r"a\.png"):
-        images.size(tmp_path / "a.png")
-
-
 @pytest.mark.parametrize("progressive", [False, True])
 def test_a_jpeg_whose_last_part_is_zeros_is_refused(
     tmp_path: Path, noise: images.ImageArray, progressive: bool
@@ -274,23 +266,6 @@ def test_an_encapsulated_postscript_program_is_not_run(tmp_path: Path) -> None:
         images.read(file)
 
 
-def declared(width: int, height: int) -> bytes:
-    """A PNG of one pixel whose header declares this size."""
-    stream = io.BytesIO()
-    Image.new("L", (1, 1)).save(stream, "PNG")
-    content = stream.getvalue()
-    size = width.to_bytes(4, "big") + height.to_bytes(4, "big")
-    head = b"IHDR" + size + content[24:29]
-    return content[:12] + head + zlib.crc32(head).to_bytes(4, "big") + content[33:]
-
-
-def test_an_image_that_declares_too_many_pixels_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "a.png").write_bytes(declared(1 << 20, 1 << 20))
-    for reader in (images.size, images.read):
-        with pytest.raises(ImageError, match=r"a\.png.*decompression bomb"):
-            reader(tmp_path / "a.png")
-
-
 def bitmap(width: int, height: int) -> bytes:
     """A BMP of one pixel whose header declares this size."""
     stream = io.BytesIO()
@@ -307,10 +282,11 @@ def test_a_photograph_of_200_megapixels_is_admitted_and_a_larger_one_refused(
     assert images.size(tmp_path / "a.bmp") == (16_320, 12_240)
     (tmp_path / "a.bmp").write_bytes(bitmap(1 << 14, 1 << 14) + zeros)
     assert images.size(tmp_path / "a.bmp") == (1 << 14, 1 << 14)
-    (tmp_path / "a.bmp").write_bytes(bitmap(1 << 14, (1 << 14) + 1) + zeros)
-    for reader in (images.size, images.read):
-        with pytest.raises(ImageError, match=r"a\.bmp: "):
-            reader(tmp_path / "a.bmp")
+    for width, height in ((1 << 14, (1 << 14) + 1), (1 << 16, 1 << 16)):  # Pillow refuses this one
+        (tmp_path / "a.bmp").write_bytes(bitmap(width, height) + zeros)
+        for reader in (images.size, images.read):
+            with pytest.raises(ImageError, match=r"a\.bmp: "):
+                reader(tmp_path / "a.bmp")
 
 
 @pytest.mark.parametrize(

@@ -97,18 +97,12 @@ def test_a_folder_that_can_not_be_meant_is_refused(
         masks.find(str(tmp_path / "none"), {"a": Path("x")})
 
 
-def folder_scene(tmp_path: Path, count: int = 3) -> Any:
-    for number in range(count):
-        save(tmp_path / "photos" / f"{number}.png", noise((60, 40), number))
-        save(tmp_path / "photos" / "m" / f"{number}.png", np.full((40, 60, 3), 255, np.uint8))
-    return replace(
-        scene_conf("folder", f"{tmp_path}/photos/**"), masks=str(tmp_path / "photos" / "m")
-    )
-
-
 def test_the_fingerprint_of_a_scene_has_the_bytes_of_its_masks(tmp_path: Path) -> None:
     """Masks below the photographs are no photographs."""
-    conf = folder_scene(tmp_path)
+    for number in range(3):
+        save(tmp_path / "photos" / f"{number}.png", noise((60, 40), number))
+        save(tmp_path / "photos" / "m" / f"{number}.png", np.full((40, 60, 3), 255, np.uint8))
+    conf = replace(scene_conf("folder", f"{tmp_path}/photos/**"), masks=f"{tmp_path}/photos/m")
     found = scenes.resolve(conf, tmp_path)
     assert list(found.files) == list(found.masks) == ["0", "1", "2"]
     assert found.notes == ()
@@ -124,16 +118,12 @@ USED = np.zeros((40, 60), np.bool_)
 USED[:, 30:] = True
 
 
-def as_rgba(transparent: int) -> Image.Image:
-    """White on `transparent` in the colours, and opaque where used."""
-    grey = np.where(USED, 255, transparent).astype(np.uint8)
-    return Image.fromarray(np.dstack([grey, grey, grey, USED * np.uint8(255)]))
-
-
 GREY = Image.fromarray(USED * np.uint8(255))
+#: White, and opaque only where it is used.
+TRANSPARENT = Image.merge("RGBA", [*[Image.new("L", (60, 40), 255)] * 3, GREY])
 FORMS: dict[str, tuple[Image.Image, str]] = {
     "1 bit": (GREY.convert("1"), "png"),
-    "transparent where it is not used": (as_rgba(255), "png"),
+    "transparent where it is not used": (TRANSPARENT, "png"),
     "palette": (GREY.convert("RGB").convert("P", palette=Image.Palette.ADAPTIVE), "png"),
     "a colour": (
         Image.merge("RGB", [Image.new("L", (60, 40)), GREY, Image.new("L", (60, 40))]),

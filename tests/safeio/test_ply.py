@@ -118,14 +118,6 @@ def test_ends_of_lines_and_spaces(tmp_path: Path, end: str, form: str, body: byt
     assert vertices.tolist() == [(1.5, 200), (-2.0, 10)]
 
 
-@pytest.mark.parametrize("name", [*ply._TYPES])
-def test_every_name_of_a_type(tmp_path: Path, name: str) -> None:
-    values = np.array([1, 100], ply._TYPES[name])
-    header = f"element vertex 2\nproperty {name} x"
-    read = ply.read(write(tmp_path / "a.ply", header, values.tobytes()))
-    np.testing.assert_array_equal(read.vertices["x"], values)
-
-
 def test_blank_lines_of_a_header_are_read_over(tmp_path: Path) -> None:
     header = "comment a\n\nelement vertex 1\n \nproperty uchar x"
     read = ply.read(write(tmp_path / "a.ply", header, b"\x07"))

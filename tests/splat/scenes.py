@@ -62,7 +62,6 @@ def make_scene(
     *,
     seed: int = 0,
     dtype: torch.dtype = torch.float64,
-    degree: int = 3,
     size: float = 2.0,
 ) -> Scene:
     """Activated parameters of Gaussians some `size` px large, in and around the image."""
@@ -86,7 +85,7 @@ def make_scene(
         "scales": torch.exp(0.5 * normal(count, 3)) * size * z[:, None] / K[0, 0],
         "opacities": 0.05 + 0.9 * uniform(count),
         "sh0": normal(count, 1, 3),
-        "shN": 0.3 * normal(count, (degree + 1) ** 2 - 1, 3),
+        "shN": 0.3 * normal(count, 15, 3),
     }
     return {name: value.to(dtype) for name, value in scene.items()}
 
@@ -187,9 +186,9 @@ def noise(height: int, width: int, seed: int = 0) -> Tensor:
     return torch.rand(height, width, 3, generator=generator, dtype=torch.float64)
 
 
-def similar_pair(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+def similar_pair(height: int, width: int) -> tuple[Tensor, Tensor]:
     """Two images of the same waves, each with noise of its own: their SSIM is about 0.5."""
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     waves = 0.5 + 0.3 * torch.sin(x / 5.0 + y / 3.0)[..., None].expand(-1, -1, 3).double()
-    first, second = (noise(height, width, each) - 0.5 for each in (seed, seed + 1))
+    first, second = (noise(height, width, seed) - 0.5 for seed in (0, 1))
     return waves + 0.2 * first, waves + 0.2 * second

@@ -24,10 +24,10 @@ def looking_at(position: Array, target: Array) -> Array:
     return viewmat
 
 
-def ring(degrees: Array, radius: float = 2.0, height: float = 0.75) -> Poses:
+def ring(degrees: Array) -> Poses:
     """Cameras at these azimuths around a point that they look at, with points around it."""
     angles = np.radians(degrees)
-    offsets = np.stack([radius * np.cos(angles), radius * np.sin(angles), 0 * angles + height], 1)
+    offsets = np.stack([2 * np.cos(angles), 2 * np.sin(angles), 0 * angles + 0.75], 1)
     viewmats = np.stack([looking_at(TARGET + offset, TARGET) for offset in offsets])
     points = TARGET + np.random.default_rng(0).normal(size=(200, 3)) * 0.1
     return Poses(viewmats, viewmats[:1], points)
@@ -89,11 +89,11 @@ def test_an_orbit_stays_where_the_scene_was_photographed_from() -> None:
     assert angles[20] == pytest.approx(10, abs=0.5), "and back"
 
 
-def outwards(degrees: Array, radius: float = 1.0) -> Poses:
+def outwards(degrees: Array) -> Poses:
     """Cameras on a circle in a room, which look at its walls."""
     angles = np.radians(degrees)
     ways = np.stack([np.cos(angles), np.sin(angles), 0 * angles], 1)
-    viewmats = np.stack([looking_at(TARGET + radius * w, TARGET + 4 * w) for w in ways])
+    viewmats = np.stack([looking_at(TARGET + w, TARGET + 4 * w) for w in ways])
     return Poses(viewmats, viewmats[:1], np.concatenate([TARGET + 4 * ways, TARGET + 3.8 * ways]))
 
 

@@ -92,13 +92,6 @@ def test_a_file_of_something_else_is_named(tmp_path: Path, content: bytes) -> No
         weights.read_pickle(content, "w.ckpt")
 
 
-def test_an_npz_that_needs_a_pickle_is_refused(tmp_path: Path) -> None:
-    np.savez(tmp_path / "w.npz", a=np.array([Evil(tmp_path / "made")], dtype=object))
-    with pytest.raises(WeightsError, match="not an archive of arrays"):
-        weights.load(tmp_path / "w.npz")
-    assert not (tmp_path / "made").exists()
-
-
 def test_the_places_in_order(
     nowhere: Path, known: Weights, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

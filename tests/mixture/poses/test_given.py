@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import sqlite3
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -130,33 +128,6 @@ def test_files_of_other_programs_are_named_with_what_to_do(
     if name not in ("images.txt", "points.ply", "registration.csv"):
         with pytest.raises(XrgsError, match=rf"{name} can't be read: export the cameras"):
             poses.fingerprint(str(tmp_path))
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "is_named"),
-    [
-        ("Thumbs.db", b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", False),
-        ("other.db", b"", False),
-        ("Database.DB", b"", True),
-        ("mine.db", None, True),
-    ],
-)
-def test_only_a_database_is_named_as_colmap_s(
-    tmp_path: Path, name: str, content: bytes | None, is_named: bool
-) -> None:
-    """Windows' Thumbs.db has the header of an OLE file; `None` is a database of SQLite's own."""
-    if content is None:
-        with closing(sqlite3.connect(tmp_path / name)) as database:
-            database.execute("CREATE TABLE cameras (camera_id INTEGER)")
-    else:
-        (tmp_path / name).write_bytes(content)
-    with pytest.raises(XrgsError, match=r"COLMAP's folder is often called sparse/0") as of_folder:
-        poses.fingerprint(str(tmp_path))
-    with pytest.raises(XrgsError) as of_file:
-        poses.fingerprint(str(tmp_path / name))
-    assert (name in str(of_folder.value)) == is_named
-    assert ("COLMAP's database" in str(of_file.value)) == is_named
-    assert name in str(of_file.value)
 
 
 @pytest.mark.parametrize(

@@ -242,15 +242,6 @@ def test_masks_are_named_by_image(tmp_path: Path) -> None:
 # points
 
 
-def write_points(file: Path, kind: str, names: tuple[str, ...], values: NDArray[Any]) -> Path:
-    dtype = [(axis, "f8") for axis in "xyz"] + [(name, kind) for name in names]
-    rows = np.array([(*xyz, *row) for xyz, row in zip(POINTS, values, strict=True)], dtype=dtype)
-    cameras = np.array([(1.0,), (2.0,)], dtype=[("view_px", "f4")])
-    elements = [PlyElement.describe(cameras, "camera"), PlyElement.describe(rows, "vertex")]
-    PlyData(elements, byte_order=">").write(file)
-    return file
-
-
 RGB = ("red", "green", "blue")
 COLORS = np.random.default_rng(2).integers(0, 256, (len(POINTS), 3))
 
@@ -270,7 +261,11 @@ def test_colours_of_any_type_are_read(
     tmp_path: Path, kind: str, names: tuple[str, ...], scale: float
 ) -> None:
     values = COLORS[:, ::-1] if names[0] == "blue" else COLORS
-    file = write_points(tmp_path / "a.ply", kind, names, values * scale)
-    points, colors = colmap.read_points(file)
+    dtype = [(axis, "f8") for axis in "xyz"] + [(name, kind) for name in names]
+    rows = np.array([(*p, *c) for p, c in zip(POINTS, values * scale, strict=True)], dtype=dtype)
+    cameras = np.array([(1.0,), (2.0,)], dtype=[("view_px", "f4")])
+    elements = [PlyElement.describe(cameras, "camera"), PlyElement.describe(rows, "vertex")]
+    PlyData(elements, byte_order=">").write(tmp_path / "a.ply")
+    points, colors = colmap.read_points(tmp_path / "a.ply")
     assert points == pytest.approx(POINTS)
     assert (colors == COLORS).all()

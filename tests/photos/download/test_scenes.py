@@ -241,15 +241,6 @@ def test_too_many_files_or_bytes_are_refused(
         unpack(archive(tmp_path), "set/fern", tmp_path / "fern")
 
 
-def test_the_files_are_on_the_disk_before_the_folder_has_its_name(
-    tmp_path: Path, disk_events: list[str]
-) -> None:
-    unpack(archive(tmp_path), "set/fern", tmp_path / "data" / "fern")
-    *before, renamed, after = disk_events
-    assert sorted(before) == ["sync a.png", "sync fern", "sync images", "sync poses.npy"]
-    assert [renamed, after] == ["rename fern to fern", "sync data"]
-
-
 @pytest.mark.parametrize("damage", ["cut", "flip", "encrypted"])
 def test_a_damaged_archive_leaves_nothing_behind(tmp_path: Path, damage: str) -> None:
     file = archive(tmp_path)

@@ -15,13 +15,13 @@ from xrgs.config import SceneConf
 
 @pytest.fixture
 def fill() -> Callable[..., SceneConf]:
-    """(folder, *names, size) -> the scene of a folder with photographs of noise by these names."""
+    """(folder, *names) -> the scene of a folder with photographs of noise by these names."""
 
-    def filled(folder: Path, *names: str, size: tuple[int, int] = (40, 30)) -> SceneConf:
+    def filled(folder: Path, *names: str) -> SceneConf:
         folder.mkdir(parents=True, exist_ok=True)
         rng = np.random.default_rng(len(names))
         for name in names:
-            pixels = rng.integers(0, 255, (size[1], size[0], 3), dtype=np.uint8)
+            pixels = rng.integers(0, 255, (30, 40, 3), dtype=np.uint8)
             Image.fromarray(pixels).save(folder / name)
         return scene_conf("folder", folder)
 

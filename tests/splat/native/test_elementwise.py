@@ -30,10 +30,10 @@ ENDS = {"exp": [0, 1, 1, np.inf], "logistic": [0, 0.5, 0.5, 1]}
 """Values at -inf, -0, 0 and inf."""
 
 
-def floats_around(value: float, count: int = 300) -> NDArray[np.float32]:
-    """The floats that are next to a value, on both sides."""
+def floats_around(value: float) -> NDArray[np.float32]:
+    """The 300 floats that are next to a value, on each side."""
     bits = int(np.float32(value).view(np.int32))
-    return np.arange(bits - count, bits + count, dtype=np.int32).view(np.float32)
+    return np.arange(bits - 300, bits + 300, dtype=np.int32).view(np.float32)
 
 
 def every_magnitude() -> NDArray[np.float32]:

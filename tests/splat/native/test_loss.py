@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from functools import partial
 
 import pytest
@@ -102,33 +101,6 @@ def test_it_is_the_torch_loss_in_double(
     without = native_loss(image, prepare_target(photograph), l1=l1, ssim=ssim, pixel_weight=weight)
     assert without.item() == loss
     assert not without.requires_grad
-
-
-@pytest.mark.parametrize(
-    ("of", "where"),
-    [
-        ("image", (0, 0, 0)),
-        ("image", (20, 13, 2)),
-        ("image", (29, 40, 1)),
-        ("photograph", (3, 4, 1)),
-        ("weight", (20, 13)),
-    ],
-)
-def test_nan_shows_where_a_window_has_it_and_nowhere_else(of: str, where: tuple[int, ...]) -> None:
-    image, photograph = pair(30, 41)
-    weight = torch.ones(30, 41)
-    {"image": image, "photograph": photograph, "weight": weight}[of][where] = float("nan")
-    loss, gradient = value_and_gradient(
-        image, photograph, "native", weight=weight if of == "weight" else None
-    )
-    assert math.isnan(loss)
-    assert gradient[where].isnan().all()
-    y, x, *channel = where
-    rows, columns = (torch.arange(n) for n in (30, 41))
-    far = ((rows - y).abs() > 10)[:, None] | ((columns - x).abs() > 10)[None]
-    assert gradient[far].isfinite().all()
-    others = [c for c in range(3) if channel and c not in channel]
-    assert gradient[..., others].isfinite().all()
 
 
 def test_types_are_checked() -> None:

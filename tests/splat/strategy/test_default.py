@@ -26,13 +26,6 @@ def random_start(count: int, rng: np.random.Generator) -> dict[str, Tensor]:
     return values | {"scales": size + values["scales"]}
 
 
-def random_gradients(values: dict[str, Tensor], rng: np.random.Generator) -> dict[str, Tensor]:
-    return {
-        name: torch.from_numpy(rng.normal(size=value.shape)).float()
-        for name, value in values.items()
-    }
-
-
 def random_view(count: int, rng: np.random.Generator, size: float = 2e-5) -> View:
     gradient = rng.normal(size=(count, 2)) * rng.exponential(size, size=(count, 1))
     visible = torch.from_numpy(rng.random(count) < 0.7)
@@ -120,7 +113,10 @@ def test_a_run_of_3000_steps_is_gsplats() -> None:
     for step in range(config.stop + 200):
         count = len(ours.gaussians)
         if step < config.stop:  # nothing changes after it
-            gradients = random_gradients(vars(ours.gaussians), rng)
+            gradients = {
+                name: torch.from_numpy(rng.normal(size=value.shape)).float()
+                for name, value in vars(ours.gaussians).items()
+            }
             gradients["scales"] -= 0.3  # some grow until they are too large
             descend(ours, theirs, gradients)
         view = random_view(count, rng, size=4.4e-6)

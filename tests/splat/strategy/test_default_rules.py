@@ -21,13 +21,13 @@ NO_HOOKS = StrategyHooks()
 strategy_of = partial(make_strategy, scene_scale=SCENE_SCALE)
 
 
-def uniform(count: int, *, scale: float = 0.01, opacity: float = 0.5) -> dict[str, Tensor]:
-    """Gaussians at random places, of one scale and opacity."""
+def uniform(count: int, *, opacity: float = 0.5) -> dict[str, Tensor]:
+    """Gaussians at random places, of the scale 0.01 and one opacity."""
     generator = torch.Generator().manual_seed(0)
     return {
         "means": torch.randn(count, 3, generator=generator),
         "quats": torch.randn(count, 4, generator=generator),
-        "scales": torch.full((count, 3), math.log(scale)),
+        "scales": torch.full((count, 3), math.log(0.01)),
         "opacities": torch.logit(torch.full((count,), opacity)),
         "sh0": torch.randn(count, 1, 3, generator=generator),
         "shN": torch.randn(count, 3, 3, generator=generator),

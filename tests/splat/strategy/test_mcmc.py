@@ -12,10 +12,9 @@ from torch import Tensor
 from tests.splat.scenes import make_optimizer, take_step
 from tests.splat.strategy.gsplats import SCENE_SCALE, TheirsMCMC, random_values, relocation
 from xrgs.splat.gaussians import PARAMETERS
-from xrgs.splat.settings import STRATEGIES, DensifySettings
+from xrgs.splat.settings import DensifySettings
 from xrgs.splat.strategy.base import Refinement
 from xrgs.splat.strategy.mcmc import MOST_SHARES, MCMCStrategy, share_out
-from xrgs.training import loop
 
 SETTINGS = DensifySettings(stop=25_000, budget=1.0, noise=5e5)
 NOTHING = torch.zeros(0, dtype=torch.bool)
@@ -113,23 +112,6 @@ def test_shares_are_those_of_gsplats_kernel(opacity: float) -> None:
     torch.testing.assert_close(torch.stack([shared, factors]), expected, rtol=1e-8, atol=0)
 
 
-@pytest.mark.parametrize(("opacity", "shares"), [(0.01, 51), (0.3, 2), (0.8, 10), (0.99, 3)])
-def test_shares_are_as_opaque_as_the_gaussian_and_have_its_integral(
-    opacity: float, shares: int
-) -> None:
-    from scipy.integrate import quad
-
-    of_one = torch.tensor([opacity], dtype=torch.float64)
-    shared, factor = (value.item() for value in share_out(of_one, torch.tensor([shares])))
-
-    def composite(x: float) -> float:
-        return 1 - (1 - shared * math.exp(-0.5 * (x / factor) ** 2)) ** shares
-
-    assert composite(0.0) == pytest.approx(opacity, rel=1e-12)
-    integral, _ = quad(composite, -40, 40, points=[0.0], limit=200)
-    assert integral == pytest.approx(opacity * math.sqrt(2 * math.pi), rel=1e-7)
-
-
 def test_many_shares_and_full_opacity_stay_finite() -> None:
     opacities = torch.tensor([1.0, 1.0, 0.0, 0.5], dtype=torch.float64)
     shared, factors = share_out(opacities, torch.tensor([1, 51, 1, 1000]))
@@ -211,7 +193,3 @@ def test_the_defaults_are_gsplats() -> None:
     assert (theirs.refine_start_iter, theirs.refine_stop_iter) == (SETTINGS.start, SETTINGS.stop)
     assert (theirs.refine_every, theirs.noise_lr) == (SETTINGS.every, SETTINGS.noise)
     assert theirs.min_opacity == SETTINGS.prune_opacity
-
-
-def test_every_name_of_a_strategy_has_a_class() -> None:
-    assert tuple(loop.STRATEGIES) == STRATEGIES

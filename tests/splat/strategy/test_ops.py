@@ -129,10 +129,10 @@ def test_the_best_are_those_of_a_sorted_list(
     assert chosen.nonzero()[:, 0].tolist() == sorted(ranked[:count])
 
 
-def strategy_within(budget: float, count: int = 8, **settings: float) -> DefaultStrategy:
+def strategy_within(budget: float) -> DefaultStrategy:
     """A budget for each of 400 pixels, with refinements at steps 600, 700, 800 and 900."""
-    schedule = DensifySettings(stop=1000, budget=budget, split="long_axis", **settings)  # type: ignore[arg-type]
-    return make_strategy(opaque(count), schedule, view_pixels=SIDE * SIDE)
+    schedule = DensifySettings(stop=1000, budget=budget, split="long_axis")
+    return make_strategy(opaque(8), schedule, view_pixels=SIDE * SIDE)
 
 
 @pytest.mark.parametrize(

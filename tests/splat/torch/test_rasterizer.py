@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from torch import Tensor
 
 from tests.splat.scenes import (
@@ -37,47 +34,6 @@ def test_tiles_and_batches_make_no_difference(monkeypatch: pytest.MonkeyPatch) -
     for other in renders[1:]:
         for ours, theirs in zip(renders[0], other, strict=True):
             torch.testing.assert_close(ours, theirs, rtol=1e-11, atol=1e-11)
-
-
-@pytest.mark.slow
-@given(
-    seed=st.integers(0, 2**31),
-    count=st.integers(0, 30),
-    width=st.integers(1, 24),
-    height=st.integers(1, 24),
-    stretch=st.floats(-25, 25),
-    dtype=st.sampled_from([torch.float32, torch.float64]),
-    antialiased=st.booleans(),
-)
-@settings(max_examples=40)
-def test_random_scenes(
-    seed: int,
-    count: int,
-    width: int,
-    height: int,
-    stretch: float,
-    dtype: torch.dtype,
-    antialiased: bool,
-) -> None:
-    camera = make_camera(width, height, turned=bool(seed % 2))
-    scene = make_scene(count, camera, seed=seed, dtype=dtype)
-    scene["scales"][::2, 0] *= float(np.exp(stretch))
-    scene["means"][1::3] -= 2 * (scene["means"][1::3] - camera.position.to(dtype))  # behind
-    raster = RasterSettings(antialiased=antialiased, background=(1.0, 1.0, 1.0))
-    scene["sh0"][:] = 0.5 / 0.28209479177387814
-    scene["shN"][:] = 0
-    leaves = with_gradients(scene)
-    render = draw(leaves, camera, raster)
-    # All white before white is white, whatever hides what.
-    torch.testing.assert_close(
-        render.image, torch.ones(height, width, 3, dtype=dtype), atol=2e-6, rtol=0
-    )
-    assert ((render.alpha >= 0) & (render.alpha < 1)).all()
-    assert not render.visible[1::3].any()
-    torch.autograd.backward(render.image.square().mean())
-    for gradient in gradients_of(leaves).values():
-        assert gradient.isfinite().all()
-        assert (gradient[~render.visible] == 0).all()
 
 
 def test_too_many_pairs_is_an_error_before_they_are_made(monkeypatch: pytest.MonkeyPatch) -> None:

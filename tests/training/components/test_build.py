@@ -213,44 +213,24 @@ def test_every_key_that_is_declared_off_is_one_of_these(off: ComponentsConf) -> 
 @pytest.mark.parametrize(
     ("key", "value"),
     [
-        ("loss_weighting.lr_weight", float("nan")),
-        ("gradient_scaling.lr_scale", float("inf")),
-        ("densify.lr_grow", -2.0),
-        ("densify.lr_prune", -1.0),
-        ("curriculum.lr_only", -1),
-        ("render_scale.gamma", -0.25),
-        ("consistency.weight", -1.0),
-        ("consistency.l1", -1.0),
-        ("consistency.ssim", -1.0),
-        ("adaptive_weighting.texture", -0.1),
-        ("region_weighting.texture", -0.1),
-        ("hybrid_schedule.ramp", -1),
-        ("continuous_weighting.gamma", -0.43),
-        ("mip.variance", -0.2),
         ("mip.every", 0),
         ("regularization.opacity", -0.01),
         ("regularization.scale", -0.01),
-        ("natural_selection.budget", -1.0),
         ("natural_selection.drop_every", 0),
         ("natural_selection.until", 16_000),
         ("natural_selection.until", 30_001),
-        ("floaters.near_share", -0.5),
         ("resolution_schedule.start_share", 0.0),
         ("resolution_schedule.start_share", 1.5),
         ("resolution_schedule.until", 0),
         ("supersampled.factor", 0),
         ("supersampled.late_factor", 0),
-        ("formation.widths", "camera"),
-        ("exposure.mode", "gains"),
         ("exposure.lr_final", 0.0),
-        ("loss_weighting.stat_from", "both"),
-        ("consistency.lr_mode", "folded"),
-        ("densify.decide", "everybody"),
     ],
 )
 def test_a_value_out_of_range_names_its_key(
     key: str, value: Any, build: Build, off: ComponentsConf
 ) -> None:
+    """Others are in tests/test_config.py, which tries every key of the components."""
     for name, on in ON.items():
         if name.partition(".")[0] == key.partition(".")[0]:
             put(off, name, on)

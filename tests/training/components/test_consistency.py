@@ -12,7 +12,6 @@ from tests.splat.scenes import noise
 from tests.training.components.conftest import NO_GAUSSIANS, Build, make_view
 from xrgs.config import ComponentsConf, ConsistencyConf
 from xrgs.errors import XrgsError
-from xrgs.splat.resample import resize
 from xrgs.training.components import Components, Step, TrainingView
 from xrgs.training.components.consistency import Consistency
 
@@ -130,27 +129,3 @@ def test_an_lr_view_of_full_size_is_compared_below_it(
         build(on, make_view("HR", noise(75, 50, 0)))  # smaller than the window of SSIM
     value = loss_of(build(on, hr.view, zoomed), image, Step(0, 30_000, zoomed))
     assert value == pytest.approx(paper_5_6(image, as_hr, weight=0.1, l1=0.8, ssim=0.2), rel=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("kind", "low", "high"),
-    [("one sign", 0.99, 1.01), ("smooth", 0.99, 1.01), ("white", 1.15, 1.3)],
-)
-def test_how_far_fold_is_from_exact(
-    kind: str, low: float, high: float, build: Build, on: ComponentsConf
-) -> None:
-    size = (40, 50)
-    error = {
-        "one sign": noise(*size, 5),
-        "smooth": resize(noise(4, 5, 5) - 0.5, *size),
-        "white": torch.randn(
-            *size, 3, generator=torch.Generator().manual_seed(5), dtype=torch.float64
-        ),
-    }[kind]
-    step = Step(0, 1, make_view("LR", noise(*size, 6)))
-    on.consistency.l1, on.consistency.ssim = 1.0, 0.0
-    value = {}
-    for on.consistency.lr_mode in ("fold", "exact"):
-        parts = build(on, step.view)
-        value[on.consistency.lr_mode] = loss_of(parts, step.view.image + error, step)
-    assert low < value["fold"] / value["exact"] < high

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from tests.splat.scenes import noise
 from tests.training.components.conftest import NO_GAUSSIANS, Build, make_view, renderer_of
@@ -78,16 +77,13 @@ def test_an_update_is_adams_on_the_loss_with_its_prior(mode: str) -> None:
     assert (gain > 1.02).all()
 
 
-def mean_of_hr(component: Exposure) -> Tensor:
-    return torch.stack([component.map_of(name) for name in component.names[:-1]]).mean(dim=0)
-
-
 @pytest.mark.parametrize("count", [1, 5])
 def test_the_mean_map_of_the_hr_views_is_the_identity(count: int) -> None:
     component = exposure(count=count)
     for number, name in enumerate(component.names * 2):
         teach(component, name, number, brighter=1 + 0.1 * number)
-        torch.testing.assert_close(mean_of_hr(component), torch.eye(3, 4), atol=1e-6, rtol=0)
+        mean = torch.stack([component.map_of(name) for name in component.names[:-1]]).mean(dim=0)
+        torch.testing.assert_close(mean, torch.eye(3, 4), atol=1e-6, rtol=0)
     assert not torch.allclose(component.map_of("low"), torch.eye(3, 4), atol=1e-3)
     if count == 1:
         assert torch.equal(component.map_of("h0"), torch.eye(3, 4))

@@ -17,7 +17,7 @@ from xrgs.splat.rendering import rasterize_parameters
 from xrgs.splat.settings import DensifySettings, OptimizerSettings, RasterSettings
 from xrgs.splat.strategy.default import DefaultStrategy
 from xrgs.training.components import Components, Step
-from xrgs.training.components.mip import Mip, sampling_rates, smooth
+from xrgs.training.components.mip import Mip, sampling_rates
 from xrgs.training.dataset import LoadedView
 
 NEAR = 0.01
@@ -117,16 +117,6 @@ def test_rates_follow_the_means_every_so_often() -> None:
     assert torch.equal(mip.variance, before)
     mip.before_render(gaussians.activated(), Step(200, 30_000, STEP.view))
     torch.testing.assert_close(mip.variance, 4 * before)
-
-
-def test_its_gradient_is_that_of_finite_differences() -> None:
-    generator = torch.Generator().manual_seed(0)
-    scales, opacities = (
-        torch.rand(*shape, generator=generator, dtype=torch.float64).requires_grad_()
-        for shape in ((5, 3), (5,))
-    )
-    variance = torch.rand(5, generator=generator, dtype=torch.float64)
-    assert torch.autograd.gradcheck(lambda s, o: smooth(s, o, variance), (scales, opacities))
 
 
 def test_what_is_saved_renders_as_what_was_trained() -> None:

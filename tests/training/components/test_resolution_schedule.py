@@ -10,17 +10,12 @@ import pytest
 import torch
 from torch.nn.functional import interpolate
 
-from tests.conftest import composed as compose
 from tests.splat.scenes import noise
 from tests.training.components.conftest import Build
-from tests.training.conftest import same
-from xrgs.config import ComponentsConf, Conf
+from xrgs.config import ComponentsConf
 from xrgs.errors import XrgsError
-from xrgs.splat.gaussians import Gaussians
 from xrgs.training.components import Components, Step, TrainingView
 from xrgs.training.components.resolution_schedule import ResolutionSchedule, kept_shares
-from xrgs.training.dataset import Dataset, LoadedView
-from xrgs.training.loop import train
 
 
 @pytest.fixture
@@ -112,34 +107,3 @@ def test_views_are_made_once_for_each_factor(
     assert [views["hr"].camera.width for views in at.values()] == [19, 19, 25, 38, 75]
     assert at[9000] is own
     assert _component(parts).reduced == {}  # nothing is held that is no longer used
-
-
-class HalvedFirst(ResolutionSchedule):
-    """Has a factor of 2 in the first 20 steps, whatever the spectra are."""
-
-    def factor_at(self, step: Step) -> int:
-        return 2 if step.number < 20 else 1
-
-
-def _after_20_steps(data: Dataset, conf: Conf, *extra: ResolutionSchedule) -> Gaussians:
-    seen: list[Gaussians] = []
-
-    def look(gaussians: Gaussians) -> dict[str, float | None]:
-        seen.append(gaussians)
-        return {}
-
-    train(data, conf, extra_components=extra, evaluate=look)
-    return seen[0]
-
-
-@pytest.mark.slow
-def test_the_start_is_a_training_on_small_photographs(data: Dataset) -> None:
-    conf = compose("train.steps=40", "splat.backend=auto", "train.evaluate_every=20")
-    component = HalvedFirst(conf.components.resolution_schedule, data.train, "auto")
-    own = {view.name: view for view in data.train}
-    views = component.training_views(own, Step(0, 40, data.train[0])).values()
-    small = tuple(LoadedView(v.name, v.tag, v.camera, v.image, v.sampling_rate) for v in views)
-    assert {v.camera.width < own[v.name].camera.width for v in small if v.tag == "HR"} == {True}
-    expected = _after_20_steps(replace(data, train=small), conf)
-    assert same(_after_20_steps(data, conf, component), expected)
-    assert not same(_after_20_steps(data, conf), expected)

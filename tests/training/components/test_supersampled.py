@@ -176,14 +176,6 @@ def test_the_variances_of_a_blur_and_of_the_box_of_a_pixel_add_up() -> None:
     assert found(render, taken(render, 0.8, 1.5)) == pytest.approx(expected, rel=0.04)
 
 
-@pytest.mark.slow
-def test_the_widths_that_fit_best_are_those_of_the_photograph() -> None:
-    render, truth = fine_image(100, 120), (0.85, 0.4)
-    variances = (5 * torch.tensor(truth, dtype=torch.float64)).square()
-    photograph = resize(render, 20, 24, variances=variances)
-    assert found(render, photograph) == pytest.approx(truth, abs=1e-3)
-
-
 def test_a_render_is_blurred_by_a_width_in_pixels_of_the_photograph(
     build: Build, blurred: ComponentsConf, lr: Step
 ) -> None:
