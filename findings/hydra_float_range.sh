@@ -2,8 +2,8 @@
 # Hydra's `range` of fractions has its stop or not, and other values than those that were written.
 # Version:   hydra-core 1.3.8, with its basic sweeper
 # Source:    hydra/core/override_parser/types.py: FloatRange adds Decimal(step), the exact value of the binary fraction,
-#            to Decimal(start), and compares with Decimal(stop). The documentation (Extended override syntax) says that
-#            range is like Python's, with floats too: the stop is not included.
+#            to Decimal(start), and compares with Decimal(stop). The docstring of `range`, in grammar_functions.py,
+#            says r[i] = start + step*i < stop, "integer or floating-point values".
 # Behaviour: the sum of the steps is below or above the stop by their rounding. range(0.1,0.4,0.1) has 0.4 and
 #            range(0.1,0.9,0.1) has no 0.9. Other values are the nearest to a sum, as 0.30000000000000004.
 # Guess:     (before the run) the stop is left out, and the values are those of the decimals: 0.3.
