@@ -6,7 +6,7 @@
 #            "a temporal extent that covers the slot".
 # Behaviour: opacities are right in the middle between two frames only, and 0.05 of that at each frame's own time, the
 #            first and default time of `fourdgs to-gltf` included. The written file says the same.
-# Guess:     (before the run) the scene at the time of a frame is that frame.
+# Guess:     (before the run) a conversion keeps the opacities of its .ply.
 # Matters:   frames of a dynamic scene that are rendered at k / fps, as they were taken, are nearly empty. At any other
 #            rate they flicker between 5 % and 100 % of their opacity.
 # Seen:      0.05 of the opacity at 0, 0.1, 0.2 and 0.3 s of 10 frames a second, 1.00 at 0.05, 0.15, 0.25 and 0.35 s
