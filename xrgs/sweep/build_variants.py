@@ -193,7 +193,7 @@ def _outcome(
         return PlannedVariant(error=str(error))
     except XrgsError as error:
         if isinstance(error, job.WorkError) and error.outcome == job.UNWRITABLE:
-            raise StoreError(f"store={store.path}: {error}. {job.NOTHING_LOST}") from error
+            raise StoreError(f"{error}. {job.NOTHING_LOST}") from error
         if building:
             store.check_not_gone()
             # COLMAP dies of a full disk without saying so. The scene is not at fault then.
