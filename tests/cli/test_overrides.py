@@ -395,6 +395,7 @@ def test_no_message_has_the_words_of_a_parser(word: str, said: str) -> None:
     ("word", "read"),
     [
         ("train.steps=3e3", "train.steps=3000"),
+        ("seed=9007199254740993,9223372036854775807", "seed=9007199254740993,9223372036854775807"),
         ("train.steps=1e2,2.0,5", "train.steps=100,2,5"),
         ("variant.long_side=504.0", "variant.long_side=504"),
         ("train.steps=1.5", "train.steps=1.5"),  # refused by its type

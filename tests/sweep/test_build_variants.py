@@ -309,6 +309,43 @@ def photographs(folder: Path, count: int, size: tuple[int, int] = (120, 80)) -> 
     return folder
 
 
+@pytest.mark.parametrize(
+    ("files", "photographs_in", "named"),
+    [
+        (("sparse/0/cameras.bin", "sparse/0/images.bin"), "", "/sparse/0"),
+        (("sparse/0/cameras.bin", "sparse/0/images.bin"), "images", "/sparse/0"),
+        (("transforms.json",), "/**", ""),
+        (("transforms.json",), "day 1", None),
+        (("sparse/0/cameras.bin",), "", None),
+    ],
+)
+def test_cameras_beside_the_photographs_are_named_with_the_word_that_reads_them(
+    of_folder: Callable[..., Conf],
+    store: Store,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    files: tuple[str, ...],
+    photographs_in: str,
+    named: str | None,
+) -> None:
+    """Trainers of Gaussians read such cameras unasked."""
+    scene, lines = tmp_path / "my scene", list[str]()
+    for file in files:
+        (scene / file).parent.mkdir(parents=True, exist_ok=True)
+        (scene / file).write_bytes(bytes(8))
+    photographs(scene / "images", 4)
+    photographs(scene / "day 1", 4)
+    monkeypatch.setattr(job, "run_in_child", lambda *_: {"variant": "k-1"})
+    monkeypatch.setattr(build_variants, "log_line", lines.append)
+    folder = f"{scene}{photographs_in}" if "*" in photographs_in else str(scene / photographs_in)
+    conf = of_folder(Path(folder), factor=1, poses=None)
+    build_variants.build(conf, store)
+    build_variants.build(of_folder(Path(folder), factor=1, poses="p"), store)
+    said = [line.partition("; ")[2] for line in lines]
+    word = f"'variant.poses={scene}{named}' takes those that are there"
+    assert said == ["" if named is None else word, ""]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("count", "size", "changes", "error"),

@@ -47,7 +47,7 @@ def test_the_answer_of_the_child_is_returned(child: Callable[..., None]) -> None
         (ProcessEnd(0), {"error": "no photographs"}, "failed", "no photographs"),
         (ProcessEnd(os.EX_TEMPFAIL), {"error": "x", "outcome": LOCKED}, LOCKED, "x"),
         (ProcessEnd(-signal.SIGTERM, "it took too long"), None, "failed", "it took too long"),
-        (ProcessEnd(os.EX_IOERR), None, UNWRITABLE, "is the disk full?"),
+        (ProcessEnd(os.EX_IOERR), None, UNWRITABLE, "set TMPDIR"),
         (ProcessEnd(3), None, "failed", "ended with exit code 3 before it answered"),
         (ProcessEnd(-signal.SIGTERM), None, INTERRUPTED, "ended by SIGTERM$"),
         (ProcessEnd(-signal.SIGSEGV), None, "failed", "ended by SIGSEGV$"),
@@ -124,7 +124,9 @@ def test_the_child_answers_with_the_result_or_the_error(
 
 
 def test_a_child_that_can_not_write_its_answer_says_so_by_its_exit_code(
-    in_this_process: Callable[..., dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+    in_this_process: Callable[..., dict[str, Any]],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "no room")
@@ -133,6 +135,7 @@ def test_a_child_that_can_not_write_its_answer_says_so_by_its_exit_code(
     with pytest.raises(SystemExit) as end:
         in_this_process(lambda _: {})
     assert end.value.code == os.EX_IOERR
+    assert capsys.readouterr().err == ""
 
 
 def test_a_child_whose_store_is_gone_leaves_it_to_its_parent_to_say_so(

@@ -7,6 +7,7 @@ import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import is_dataclass
+from decimal import Decimal
 from itertools import accumulate, pairwise
 from traceback import walk_tb
 from typing import Any, cast
@@ -64,7 +65,7 @@ _FLAGS = frozenset({"dry_run", "fail_fast"})
 #: The most names that a message lists.
 _MAX_LISTED = 20
 #: Numbers that may be whole, also as 3e3 or 100.0.
-_WHOLE = re.compile(r"\d+(?:\.\d*)?(?:[eE]\+?\d+)?|\d+\.0*")
+_WHOLE = re.compile(r"\d+(?:\.\d*)?(?:[eE]\+?\d{1,2})?")
 _NUMBER = r"-?\d+(?:\.\d+)?(?:[eE][+-]?\d+)?"
 #: Two numbers as people write a range, and numbers that are separated by other signs than commas.
 _SPAN = re.compile(rf"({_NUMBER})\s*(?:-|–|—|:|\.\.+|\bto\b)\s*({_NUMBER})")
@@ -376,9 +377,10 @@ def _written_out(part: str) -> list[str]:
 
 def _whole(text: str) -> str:
     """Write a whole number as digits, `3e3` as `3000`; any other text stays."""
-    if not _WHOLE.fullmatch(text.strip()) or not (value := float(text)).is_integer():
+    if not _WHOLE.fullmatch(text.strip()):
         return text
-    return str(int(value))
+    value = Decimal(text)  # a float would round a seed above 2^53
+    return str(int(value)) if value == value.to_integral_value() else text
 
 
 def _exists(path: str) -> bool:

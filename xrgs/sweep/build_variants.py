@@ -19,9 +19,11 @@ from xrgs.mixture import photographs, split, variant
 from xrgs.mixture.degradations import DEGRADATIONS, resolve_degradation
 from xrgs.mixture.paths import failed_folder, trimmed_folder
 from xrgs.photos import scenes
+from xrgs.photos.scenes.scene import ALL_BELOW
 from xrgs.runtime.machine import usable_cores, usable_memory
 from xrgs.runtime.progress import log_line
 from xrgs.safeio.files import is_transient
+from xrgs.safeio.paths import user_path
 from xrgs.safeio.sanitize import counted
 from xrgs.store import trimming
 from xrgs.store.inspect import read_report
@@ -69,10 +71,28 @@ def build(
     work = "building the mixed-resolution variant"
     if resolve_degradation(conf.variant) == "none":
         work = "finding the cameras" if conf.variant.poses is None else "reading the cameras"
-    log_line(f"{scenes.label(conf.scene)}: {work}{place}")
+    log_line(f"{scenes.label(conf.scene)}: {work}{place}{_not_read(conf)}")
     request = {"conf": asdict(conf), "store": str(store.path)}
     answer = job.run_in_child("variant", request, None, on_poll, environment)
     return str(answer["variant"])
+
+
+def _not_read(conf: Conf) -> str:
+    """Say which word reads the cameras beside the photographs; empty without such cameras.
+
+    Other programs read them unasked. Here a folder has the same cameras with and without them.
+    """
+    from xrgs.mixture.poses import colmap, transforms
+
+    if conf.scene.kind != "folder" or conf.variant.poses is not None:
+        return ""
+    folder = user_path(str(conf.scene.path).removesuffix(ALL_BELOW))
+    for root in (folder, folder.parent) if folder.name == "images" else (folder,):
+        with suppress(OSError, XrgsError):
+            if files := transforms.in_folder(root) or colmap.files(root):
+                word = shlex.quote(f"variant.poses={files[0].parent}")
+                return f"; {word} takes those that are there"
+    return ""
 
 
 def how_to_get(scenes: Iterable[SceneConf]) -> str:
@@ -193,7 +213,7 @@ def _outcome(
         return PlannedVariant(error=str(error))
     except XrgsError as error:
         if isinstance(error, job.WorkError) and error.outcome == job.UNWRITABLE:
-            raise StoreError(f"store={store.path}: {error}. {job.NOTHING_LOST}") from error
+            raise StoreError(f"{error}. {job.NOTHING_LOST}") from error
         if building:
             store.check_not_gone()
             # COLMAP dies of a full disk without saying so. The scene is not at fault then.

@@ -413,7 +413,7 @@ def run_in_child(
         if ended.reason:
             raise WorkError(ended.reason)
         if not answer_file.exists() and ended.code == os.EX_IOERR:
-            reason = f"it could not write its answer to {name}: is the disk full?"
+            reason = f"{name} took no answer: make room there, or set TMPDIR to another folder"
             raise WorkError(reason, UNWRITABLE)
         if not answer_file.exists():
             raise _death(ended.code)
@@ -624,8 +624,7 @@ def main(work: str, request: str, answer: str) -> None:
     try:
         write_json(Path(answer).absolute(), msgspec.to_builtins(result))
     except OSError:
-        say(traceback.format_exc(), sys.stderr)
-        sys.exit(os.EX_IOERR)
+        sys.exit(os.EX_IOERR)  # the parent says so
     if result.outcome == LOCKED:
         sys.exit(os.EX_TEMPFAIL)
 

@@ -217,7 +217,8 @@ class Study:
                 return list(plan)
             if elsewhere and not to_train and not waiting_said:
                 first = elsewhere[0]
-                log_line(f"waiting for {len(elsewhere)} cells: {first.name} {first.state.reason}")
+                waited = counted(len(elsewhere), "cell")
+                log_line(f"waiting for {waited}: {first.name} {first.state.reason}")
                 waiting_said = True
             if not begun:
                 time.sleep(_POLL_S)
