@@ -1,4 +1,4 @@
-"""The metrics against scikit-image and float64 closed forms."""
+"""The metrics against scikit-image, kornia and float64 closed forms."""
 
 from __future__ import annotations
 
@@ -17,6 +17,24 @@ from tests.splat.scenes import similar_pair
 from xrgs.evaluation import metrics
 from xrgs.evaluation.lpips import weights
 from xrgs.photos import masks
+
+#: Whether more of it is better, from the metrics' own papers and common sense, not from the code.
+MORE_IS_BETTER = {
+    "training_time_s": False,
+    "render_time_ms": False,
+    "gaussians": False,
+    "memory_bytes": False,
+    "peak_rss_bytes": False,
+    "lpips": False,
+    "ssim": True,
+    "psnr": True,
+    "psnr_pooled": True,
+    "psnr_worst": True,
+    "psnr_plain": True,
+    "psnr_fitted": True,
+    "lpips_vgg": False,
+    "evaluations": False,
+}
 
 
 def pair(height: int = 40, width: int = 53) -> tuple[Tensor, Tensor]:
@@ -56,7 +74,24 @@ def test_ssim_is_its_definition() -> None:
     assert metrics.ssim(image, image) == pytest.approx(1, abs=1e-6)
 
 
-def test_psnr_is_scikit_images() -> None:
+def test_ssim_differs_from_scikit_images_by_the_border_alone() -> None:
+    from skimage.metrics import structural_similarity
+
+    image, target = pair(200, 210)
+    expected = structural_similarity(
+        image.numpy(),
+        target.numpy(),
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        data_range=1.0,
+        channel_axis=-1,
+    )
+    assert metrics.ssim(image, target) == pytest.approx(expected, abs=5e-3)
+
+
+def test_psnr_is_scikit_images_and_kornias() -> None:
+    from kornia.metrics import psnr
     from skimage.metrics import peak_signal_noise_ratio
 
     image, target = pair()
@@ -65,6 +100,7 @@ def test_psnr_is_scikit_images() -> None:
         peak_signal_noise_ratio(target.numpy().astype(float), image.numpy().astype(float)),
         rel=1e-12,
     )
+    assert value == pytest.approx(psnr(image, target, 1.0).item(), rel=1e-6)
     flat = torch.full((12, 13, 3), 0.25)
     assert metrics.psnr(flat, flat + 0.5) == pytest.approx(20 * math.log10(2), rel=1e-12)
     assert metrics.psnr(torch.zeros(12, 13, 3), torch.ones(12, 13, 3)) == 0
@@ -93,9 +129,8 @@ def test_directions_are_true(
     """A worse image scores on the worse side."""
     monkeypatch.setattr(weights, "load_published", lambda: random_weights)
     image, target = pair()
-    more_is_better = {metric.name for metric in metrics.METRICS if metric.higher_is_better}
-    psnrs = {"psnr", "psnr_pooled", "psnr_worst", "psnr_plain", "psnr_fitted"}
-    assert more_is_better == {"ssim"} | psnrs
+    better_high = {metric.name: metric.higher_is_better for metric in metrics.METRICS}
+    assert better_high == MORE_IS_BETTER
     for metric in metrics.METRICS:
         if metric.score is not None and metric.name not in {"lpips_vgg", "psnr_plain"}:
             near = metric.score(target + 0.1 * (image - target), target, None)
