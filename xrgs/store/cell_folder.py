@@ -358,8 +358,8 @@ class CellFolder:
         header, rows = read_table(self.path / HISTORY)
         table = pd.DataFrame(rows, columns=header, dtype=object)
         for name, values in number_columns(self.path / HISTORY).items():
-            is_whole = all(map(float.is_integer, values))
-            table[name] = pd.Series(values, dtype=int if is_whole else float)
+            numbers = pd.Series(values, dtype=float)
+            table[name] = numbers.astype(int) if numbers.map(float.is_integer).all() else numbers
         return table
 
     def gaussians(self) -> Gaussians:
