@@ -519,9 +519,10 @@ def _hand_over(cell: PlannedCell, threads: int, store: Store) -> list[str]:
     )
     # Under the lease: since the plan, another sweep may have begun or finished the cell.
     with lease.held(store.leases, cell.cell_id) as held:
-        state = store.cell(cell.cell_id).state(verify=False)
-        if held is not None and state.name != "done" and not state.unreadable:
-            plan_cell(store.cell(cell.cell_id), conf, cell.identity)
+        if held is not None:
+            state = store.cell(cell.cell_id).state(verify=False)
+            if state.name != "done" and not state.unreadable:
+                plan_cell(store.cell(cell.cell_id), conf, cell.identity)
     return [f"cell={cell.cell_id}", f"store={home}", f"name={cell.name}"]
 
 
