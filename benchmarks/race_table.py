@@ -94,8 +94,13 @@ def line(run: Run) -> str:
 
 
 def chosen(runs: Sequence[Run], size: int, minutes: float) -> dict[tuple[str, str], Run]:
-    """Return (arm, scene) -> the longest run within a budget."""
-    within = [run for run in runs if run.size == size and run.seconds <= 60 * minutes]
+    """Return (arm, scene) -> the longest run within a budget, of the scenes raced for it."""
+    scenes = {run.scene for run in runs if (run.size, run.minutes) == (size, minutes)}
+    within = [
+        run
+        for run in runs
+        if run.size == size and run.scene in scenes and run.seconds <= 60 * minutes
+    ]
     return {(run.arm, run.scene): run for run in sorted(within, key=lambda run: run.seconds)}
 
 
@@ -214,7 +219,12 @@ def figure(runs: Sequence[Run]) -> Figure:
         for axes, (score, name) in zip(row, _PANELS.items(), strict=True):
             _draw(axes, runs, size, score)
             axes.set(title=f"{size} px", xlabel="minutes of training on two cores", ylabel=name)
-            axes.legend()
+    handles = {
+        text: line
+        for axes in panels.flat
+        for line, text in zip(*axes.get_legend_handles_labels(), strict=True)
+    }
+    drawn.legend(handles.values(), handles.keys(), loc="outside right upper")
     return drawn
 
 

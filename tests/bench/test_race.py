@@ -65,6 +65,12 @@ def test_after_some_tries_the_longest_run_within_a_budget_has_to_do(race: Any) -
         race.plan([made(race, steps=1, seconds=2.0)], 0.01)
 
 
+def test_a_scene_that_was_not_raced_for_a_budget_is_not_in_its_table(race: Any) -> None:
+    runs = [made(race, scene="horns"), made(race), made(race, minutes=3.0, seconds=150.0)]
+    assert race.race_table.chosen(runs, 500, 3.0) == {("plus", "fern"): runs[2]}
+    assert len(race.race_table.chosen(runs, 500, 1.0)) == 2
+
+
 def test_time_that_writing_takes_does_not_count(race: Any, tmp_path: Path) -> None:
     lines: list[tuple[float, str]] = [(0.0, "Using CPU"), (9.0, "Loading a.png")]
     now = 10.0
