@@ -85,6 +85,24 @@ def test_cameras_of_pictures_of_another_size_are_named(
         assert notes[0].endswith("a, b, c")
 
 
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"w": 102, "h": 76}, "102% of the width and 99% of the height"),  # sizes were halved
+        ({"w": 408, "h": 304}, "25% of the width and 25% of the height"),
+        ({"cx": 104.0 + 30}, ""),  # a lens with shift
+    ],
+)
+def test_a_size_that_was_changed_without_its_focal_lengths_is_named(
+    photos: PhotoCollection, tmp_path: Path, changes: dict[str, Any], named: str
+) -> None:
+    """The principal point tells: it is in pixels of the size before."""
+    model = poses.read_poses(str(write_transforms(tmp_path / "poses", changes)), photos)
+    notes = [note for note in model.report["notes"] if "far from the middle" in note]
+    assert bool(notes) == bool(named)
+    assert all(named in note and note.endswith("a, b, c") for note in notes)
+
+
 @pytest.mark.parametrize("layout", ["dense/sparse", "sparse/0", "images beside"])
 def test_the_model_of_undistorted_images_is_not_taken_for_the_photographs(
     photos: PhotoCollection, tmp_path: Path, layout: str
@@ -117,6 +135,11 @@ def test_the_model_of_undistorted_images_is_not_taken_for_the_photographs(
         ("database.db", "COLMAP's database, which has no poses"),
         ("points.ply", "which has no cameras"),
         ("images.txt", "give the folder that it is in"),
+        ("photograph.xmp", "as RealityScan's cameras are"),
+        ("arrays.npz", "arrays of numpy"),
+        ("scene.usdz", "a scene of an animation program"),
+        ("reconstruction.json", "a file of OpenSfM"),
+        ("sfm_data.bin", "a file of OpenMVG"),
     ],
 )
 def test_files_of_other_programs_are_named_with_what_to_do(
@@ -126,7 +149,9 @@ def test_files_of_other_programs_are_named_with_what_to_do(
     with pytest.raises(XrgsError, match=rf"variant\.poses=.*it is .*{what}|{what}"):
         poses.fingerprint(str(tmp_path / name))
     if name not in ("images.txt", "points.ply", "registration.csv"):
-        with pytest.raises(XrgsError, match=rf"{name} can't be read: export the cameras"):
+        todo = {"poses.zip": "unpack it", "database.db": "give the folder of its model"}
+        todo_here = todo.get(name, "export the cameras")
+        with pytest.raises(XrgsError, match=rf"{name} can't be read: {todo_here}"):
             poses.fingerprint(str(tmp_path))
 
 
@@ -135,12 +160,13 @@ def test_files_of_other_programs_are_named_with_what_to_do(
     [
         ({"sfm_data_version": "0.3", "views": []}, "it is of OpenMVG"),
         ({"version": ["1"], "featuresFolders": []}, "it is of Meshroom"),
+        ([{"shots": {}, "cameras": {}}], "it is of OpenSfM"),
+        ([{"id": 0, "img_name": "a"}], "it is of 3D Gaussian Splatting"),
         ({"views": []}, "each of its frames must have a file_path"),
+        ([], "each of its frames must have a file_path"),
     ],
 )
-def test_a_json_of_another_program_is_named(
-    tmp_path: Path, content: dict[str, Any], program: str
-) -> None:
+def test_a_json_of_another_program_is_named(tmp_path: Path, content: object, program: str) -> None:
     (tmp_path / "a.json").write_text(json.dumps(content))
     with pytest.raises(XrgsError, match=rf"a\.json: not a transforms\.json.*{program}"):
         poses.fingerprint(str(tmp_path / "a.json"))

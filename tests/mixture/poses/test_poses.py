@@ -91,10 +91,13 @@ def test_a_pose_of_upright_pixels_stays_as_it_is(
     photographs: Callable[..., PhotoCollection], tmp_path: Path, orientation: int
 ) -> None:
     """The camera has the shape of the upright photograph, so that it was made with a copy."""
-    path = write_colmap(tmp_path / "poses", size=(75, 100))
+    params = (150.0, 140.0, 41.0, 48.0)
+    path = write_colmap(tmp_path / "poses", params=params, size=(75, 100))
     model = poses.read_poses(str(path), photographs(size=(100, 75), orientation=orientation))
     for i in range(3):
-        assert pixels(model, i) == pytest.approx(project(i))
+        fx, fy, cx, cy = PARAMS
+        seen = (project(i) - (cx, cy)) / (fx, fy) * params[:2] + params[2:]
+        assert pixels(model, i) == pytest.approx(seen)
     assert model.report["notes"] == []
 
 

@@ -25,6 +25,7 @@ from xrgs.mixture.poses.given import (
     check_places,
     moved_points,
     of_other_pictures,
+    off_centre,
     own_world,
     rounding,
     same_shape,
@@ -144,6 +145,7 @@ def read_poses(path: str, photos: PhotoCollection) -> Reconstruction:
             check_camera(lens, photos[i])
         given_lenses = {i: lens for i, (lens, _) in cameras.items()}
         names_of = {i: name for name, i in found.items()}
+        in_folder += off_centre(given_lenses, photos)
         in_folder += of_other_pictures(given_lenses, names_of, photos, user_path(path))
         viewmats, moved = own_world({i: viewmat for i, (_, viewmat) in cameras.items()})
         points, rounded = _moved_points(points, viewmats, moved)
@@ -269,6 +271,8 @@ def match_names(poses: Sequence[str], photographs: Sequence[tuple[str, Path]]) -
     Raises:
         XrgsError: No pose matches a photograph, or two poses match a photograph equally well.
     """
+    if not poses:
+        raise XrgsError("it has no image: the program that wrote it placed no photograph")
     photographs = [(_composed(name), Path(_composed(str(file)))) for name, file in photographs]
     ends: dict[str, set[int]] = {}  # end of a path -> its photographs
     for i, (name, file) in enumerate(photographs):

@@ -32,6 +32,9 @@ _MAX_ASPECT = 0.01
 _FOCAL_RANGE = (0.1, 100.0)
 #: Largest ratio of the focal lengths of both axes; anamorphic lenses have 2.
 _MAX_PIXEL_ASPECT = 3.0
+#: Distance of the principal point from the middle, over the side, that a note tells. K for half or
+#: twice the size has 0.5 and 0.25.
+_MOST_OFF_CENTRE = 0.2
 #: Largest ratio of the sides of a picture and of its smaller copy.
 _MOST_SMALLER = 16
 #: Least extent of the cameras over the distance of their points. Below it, points move by less than
@@ -92,6 +95,28 @@ def check_camera(lens: Lens, photo: Photograph) -> None:
         raise XrgsError(f"{shown}has focal lengths of {fx:g} and {fy:g} px, too unequal")
     if abs(cx / size[0] - 0.5) > 1.5 or abs(cy / size[1] - 0.5) > 1.5:
         raise XrgsError(f"{shown}has its principal point at {cx:g}, {cy:g} px, far outside of it")
+
+
+def off_centre(lenses: Mapping[int, Lens], photos: PhotoCollection) -> list[str]:
+    """Return a note on cameras with a principal point far from the middle of their images.
+
+    A file whose sizes were changed and whose focal lengths were not has such cameras.
+    """
+    odd = {
+        i: (lens.K[0, 2] / lens.width, lens.K[1, 2] / lens.height)
+        for i, lens in lenses.items()
+        if max(abs(lens.K[0, 2] / lens.width - 0.5), abs(lens.K[1, 2] / lens.height - 0.5))
+        > _MOST_OFF_CENTRE
+    }
+    if not odd:
+        return []
+    first, (x, y) = next(iter(odd.items()))
+    size = f"{lenses[first].width}x{lenses[first].height}"
+    return [
+        f"the cameras of {len(odd)} photographs have their principal point far from the middle, as "
+        f"at {x:.0%} of the width and {y:.0%} of the height of {size} px: right for crops, and "
+        f"wrong if only the size was changed: {listed([photos.names[i] for i in odd])}"
+    ]
 
 
 def check_places(centres: NDArray[np.float64], points: NDArray[np.float64], far: float) -> None:

@@ -118,12 +118,12 @@ def _content(file: Path) -> dict[str, Any]:
     try:
         # Some editors and shells of Windows write the mark, which JSON has not.
         text = read_file(file, _MAX_BYTES).removeprefix(codecs.BOM_UTF8)
-        content = decode_struct(text, dict[str, Any], file)
+        content: Any = decode_struct(text, object, file)
     except UnreadableError:
         raise
     except StoreError as error:
         raise XrgsError(f"{error}; a folder of COLMAP's or a transforms.json is needed") from error
-    frames = content.get("frames")
+    frames = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(frames, list) or not all(
         isinstance(frame, dict)
         and isinstance(frame.get("file_path"), str)
@@ -132,7 +132,8 @@ def _content(file: Path) -> dict[str, Any]:
     ):
         why = foreign.of_json(content) or ": each of its frames must have a file_path"
         raise XrgsError(f"{file}: not a transforms.json{why}")
-    return content
+    own: dict[str, Any] = content
+    return own
 
 
 def _points_files(contents: Mapping[Path, Mapping[str, Any]]) -> list[Path]:
