@@ -14,8 +14,8 @@ _FOLDER = "give the folder that it is in"
 #: The suffix of COLMAP's databases, their usual name, and the first bytes of an SQLite database.
 #: Windows writes Thumbs.db into folders of photographs, which is none.
 _DATABASE, _DATABASE_NAME, _SQLITE = ".db", "database.db", b"SQLite format 3\0"
-#: End of a file's name with its dot, or a whole name, in lower case -> what the file is, and what to
-#: do with it.
+#: End of a file's name with its dot, or a whole name, in lower case -> what the file is, and what
+#: to do with it.
 _ENDINGS = {
     "reconstruction.json": ("a file of OpenSfM", _AS_COLMAP),
     **dict.fromkeys(("sfm_data.json", "sfm_data.bin"), ("a file of OpenMVG", _AS_COLMAP)),
