@@ -180,6 +180,8 @@ def test_names_that_fit_nothing_or_alike_are_refused() -> None:
     assert poses.match_names(["./test/r_0", "./train/r_0"], photographs) == {"./train/r_0": 0}
     with pytest.raises(XrgsError, match=r"none of its 1 images .*: IMG_01\.jpg is not img_1"):
         poses.match_names(["IMG_01.jpg"], [("other", Path("other.png")), ("img_1", Path("img_1"))])
+    with pytest.raises(XrgsError, match="it has no image: the program that wrote it placed no"):
+        poses.match_names([], photographs)
     with pytest.raises(XrgsError, match=r"two of its images, x/a\.jpg and y/a\.jpg, have the name"):
         poses.match_names(["x/a.jpg", "y/a.jpg"], [("a", Path("a.png"))])
 
