@@ -47,16 +47,19 @@ _KEYS = {
 
 def kind(file: Path) -> str:
     """Describe a file of another program, such as `an archive`; empty if it is unknown."""
-    return next((what for end, (what, _) in _ENDINGS.items() if _ends(file, end)), "")
+    return _ENDINGS[ending][0] if (ending := _ending(file)) else ""
 
 
 def check_file(file: Path) -> None:
     """Raise XrgsError for a file of another program, which can't be a transforms.json."""
-    for ending, (what, todo) in _ENDINGS.items():
-        if _ends(file, ending):
-            raise XrgsError(
-                f"it is {what}, and not a folder of COLMAP's or a transforms.json; {todo}"
-            )
+    if ending := _ending(file):
+        what, todo = _ENDINGS[ending]
+        raise XrgsError(f"it is {what}, and not a folder of COLMAP's or a transforms.json; {todo}")
+
+
+def _ending(file: Path) -> str:
+    """Return the key of a file in `_ENDINGS`; empty if it has none."""
+    return next((ending for ending in _ENDINGS if _ends(file, ending)), "")
 
 
 def _ends(file: Path, ending: str) -> bool:
@@ -79,10 +82,10 @@ def _is_sqlite(file: Path) -> bool:
 
 def in_folder(folder: Path) -> str:
     """Name a folder's files of other programs, as the end of a message; empty if it has none."""
-    endings = [ending for ending in _ENDINGS if ending not in (".bin", ".txt", ".ply", ".csv")]
     found: dict[str, list[str]] = {}  # what to do -> names
     for name in list_names(folder):
-        for ending in [end for end in endings if _ends(folder / name, end)][:1]:
+        ending = _ending(folder / name)
+        if ending and ending not in (".bin", ".txt", ".ply", ".csv"):
             found.setdefault(_ENDINGS[ending][1], []).append(name)
     return "".join(f"; {listed(names)} can't be read: {todo}" for todo, names in found.items())
 
